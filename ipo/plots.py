@@ -1,0 +1,114 @@
+"""Figures from tidy rows. The only module besides ``render`` that imports matplotlib."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from ipo.stats import bootstrap_interval
+
+# Colours of Okabe and Ito, which colour-blind readers can tell apart; markers for print.
+STYLES = {
+    "gradient_descent": ("gradient descent", "#D55E00", "o"),
+    "overparameterized": ("overparameterised", "#E69F00", "s"),
+    "ipo_fixed_phi": ("IPO, fixed Φ", "#0072B2", "^"),
+    "ipo_variable_phi": ("IPO, variable Φ", "#56B4E9", "v"),
+    "minimum_norm": ("minimum norm, closed form", "#009E73", "D"),
+    "oracle": ("oracle", "#000000", "_"),
+}
+
+STYLE = {
+    "figure.dpi": 110,
+    "savefig.dpi": 160,
+    "font.size": 10,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.alpha": 0.25,
+    "legend.frameon": False,
+    "figure.constrained_layout.use": True,
+    "figure.facecolor": "white",
+}
+
+
+def label(method: str) -> str:
+    """The name of a method in figures and tables."""
+    return STYLES[method][0] if method in STYLES else method.replace("_", " ")
+
+
+def metric_by(rows: pd.DataFrame, metric: str, x: str) -> pd.DataFrame:
+    """One row per method and ``x`` with ``mean, low, high``: a 95 % interval over runs."""
+
+    def summary(values: pd.Series) -> pd.Series:
+        low, high = bootstrap_interval(values.to_numpy(), np.random.default_rng(0))
+        return pd.Series({"mean": values.mean(), "low": low, "high": high})
+
+    chosen = rows[rows["metric"] == metric]
+    return chosen.groupby(["method", x])["value"].apply(summary).unstack().reset_index()
+
+
+def draw_metric(
+    ax: Axes, rows: pd.DataFrame, metric: str, x: str, methods: Sequence[str], **options
+) -> None:
+    """A line per method with its interval over runs as a band."""
+    summary = metric_by(rows, metric, x)
+    for method in methods:
+        line = summary[summary["method"] == method].sort_values(x)
+        name, color, marker = STYLES[method]
+        ax.plot(line[x], line["mean"], color=color, marker=marker, ms=5, label=name, **options)
+        ax.fill_between(line[x], line["low"], line["high"], color=color, alpha=0.2, lw=0)
+
+
+def draw_paper(ax: Axes, paper: pd.DataFrame, x: str, methods: Sequence[str]) -> None:
+    """The paper's means as hollow circles."""
+    for method in methods:
+        points = paper[paper["method"] == method]
+        ax.scatter(points[x], points["mean"], s=70, facecolors="none", edgecolors="0.35", zorder=3)
+    ax.scatter([], [], s=70, facecolors="none", edgecolors="0.35", label="paper")
+
+
+def draw_oracle(ax: Axes, cost: float) -> None:
+    ax.axhline(cost, color="black", lw=1, ls="--", label="oracle")
+
+
+def observations(panels: dict[str, np.ndarray], dim_state: int) -> Figure:
+    """What the agent sees over time in several domains: ``{title: [time, n_o]}``."""
+    fig, axes = plt.subplots(1, len(panels), figsize=(9, 4.2), sharey=True, squeeze=False)
+    limit = max(np.abs(panel).max() for panel in panels.values())
+    for ax, (title, panel) in zip(axes[0], panels.items(), strict=True):
+        picture = ax.imshow(
+            panel.T, aspect="auto", cmap="RdBu_r", vmin=-limit, vmax=limit, interpolation="nearest"
+        )
+        ax.axhline(dim_state - 0.5, color="black", lw=1.5)
+        ax.set(title=title, xlabel="time step")
+        ax.grid(False)
+    axes[0, 0].set_ylabel("observation $o_t$")
+    axes[0, 0].text(0.98, dim_state / 2, "$W_c s$: state", ha="right", va="center",
+                    transform=axes[0, 0].get_yaxis_transform(), bbox=_box())  # fmt: skip
+    axes[0, 0].text(0.98, (dim_state + panel.shape[1]) / 2, "$W_d s$: distractor", ha="right",
+                    va="center", transform=axes[0, 0].get_yaxis_transform(), bbox=_box())  # fmt: skip
+    fig.colorbar(picture, ax=axes[0], label="value", shrink=0.8)
+    return fig
+
+
+def trajectories(energies: dict[str, np.ndarray], oracle: str) -> Figure:
+    """``|s_t|^2`` over time for several starts: ``{method: [starts, time]}``, median and range."""
+    fig, ax = plt.subplots(figsize=(7, 3.8))
+    for method, energy in energies.items():
+        name, color, _ = STYLES[method]
+        steps = np.arange(energy.shape[1])
+        low, middle, high = np.quantile(energy, [0.05, 0.5, 0.95], axis=0)
+        ax.plot(steps, middle, color=color, label=name, ls="--" if method == oracle else "-")
+        ax.fill_between(steps, low, high, color=color, alpha=0.15, lw=0)
+    ax.set(yscale="log", xlabel="time step", ylabel="$|s_t|^2$", ylim=(1e-6, None))
+    ax.legend()
+    return fig
+
+
+def _box() -> dict[str, object]:
+    return {"facecolor": "white", "alpha": 0.85, "edgecolor": "none", "pad": 2}
