@@ -1,0 +1,46 @@
+# The reproducibility book of Invariant Policy Optimization. `make help` lists the targets.
+
+PYTHON ?= python3
+PROFILE ?= class
+STARTED := $(shell date +%s)
+IN_VENV := .venv/bin/python
+SETUP_SECONDS = --setup-seconds $$(( $$(date +%s) - $(STARTED) ))
+
+.DEFAULT_GOAL := help
+.PHONY: help setup book test reproduce claims serve lab lint format clean
+
+help: ## this list
+	@awk -F ':.*## ' '/^[a-z]+:.*## /{printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+
+setup: ## the environment in .venv (every other target does it first)
+	@$(PYTHON) book/setup.py
+
+book: setup ## execute what changed and build the site [PROFILE=class] [JOBS=cores]
+	@$(IN_VENV) book/build.py --profile $(PROFILE) $(if $(JOBS),--jobs $(JOBS)) $(SETUP_SECONDS)
+
+test: ## set-up, browser included, and the default test suite
+	@$(PYTHON) book/setup.py --system
+	@$(IN_VENV) -m pytest
+
+reproduce: setup ## every result from nothing, into data/reproduced [CHAPTER=lqr]
+	@rm -rf book/_executed/paper
+	@$(IN_VENV) book/build.py --profile paper $(if $(CHAPTER),--chapter $(CHAPTER)) $(SETUP_SECONDS)
+	@echo "The rows are in data/reproduced"
+
+claims: setup ## decide every claim of the paper again from the rows in data/
+	@$(IN_VENV) book/claims.py
+
+serve: setup ## the built site on http://localhost:8000
+	@$(IN_VENV) -m http.server --bind localhost --directory book/_build/html
+
+lab: setup ## the notebooks in JupyterLab
+	@$(IN_VENV) -m jupyterlab
+
+lint: setup ## ruff's checks and format, without changing anything
+	@$(IN_VENV) -m ruff check && $(IN_VENV) -m ruff format --check
+
+format: setup ## ruff's format and safe repairs
+	@$(IN_VENV) -m ruff check --fix && $(IN_VENV) -m ruff format
+
+clean: ## remove what was built; the environment and data/ stay
+	@rm -rf book/_build book/_executed .pytest_cache .ruff_cache .hypothesis
