@@ -1,0 +1,34 @@
+"""What tests of several folders share: the site of this project, built once, smoke profile."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from filelock import FileLock
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture(scope="session")
+def smoke_build(tmp_path_factory, worker_id) -> Path:
+    """The folder with `_executed/smoke` and `_build/html`, made by the build itself.
+
+    Every worker asks for it; the first builds, the others find nothing left to do.
+    """
+    folder = tmp_path_factory.getbasetemp()
+    if worker_id != "master":
+        folder = folder.parent
+    output = folder / "smoke"
+    command = [sys.executable, "book/build.py", "--profile", "smoke", "--output", str(output)]
+    with FileLock(folder / "smoke.lock"):
+        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    if done.returncode:
+        pytest.fail(f"The book does not build:\n{done.stdout}{done.stderr}", pytrace=False)
+    return output
+
+
+@pytest.fixture(scope="session")
+def built_site(smoke_build) -> Path:
+    """The folder of the site's pages."""
+    return smoke_build / "_build" / "html"

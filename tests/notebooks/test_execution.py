@@ -1,0 +1,49 @@
+"""Every notebook runs: by the build in the smoke profile, and by hand."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import nbformat
+import pytest
+import yaml
+
+ROOT = Path(__file__).resolve().parents[2]
+NAMES = [path.stem for path in sorted((ROOT / "notebooks").glob("*.ipynb"))]
+SMOKE = yaml.safe_load((ROOT / "notebooks" / "profiles" / "smoke.yml").read_text())
+
+
+def papermill(name: str, output: Path, *options: str) -> subprocess.CompletedProcess:
+    command = [sys.executable, "-m", "papermill", f"notebooks/{name}.ipynb", str(output), *options]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_cell_ran(smoke_build, name):
+    executed = nbformat.read(smoke_build / "_executed" / "smoke" / f"{name}.ipynb", as_version=4)
+    code = [cell for cell in executed.cells if cell.cell_type == "code"]
+    assert [cell.execution_count for cell in code] == list(range(1, len(code) + 1))
+    assert "error" not in {output.output_type for cell in code for output in cell.outputs}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_executed_copy_holds_no_times_and_no_places(smoke_build, name):
+    text = (smoke_build / "_executed" / "smoke" / f"{name}.ipynb").read_text()
+    traces = ('"papermill"', "start_time", "iopub", str(ROOT), "ipykernel_")
+    assert [trace for trace in traces if trace in text] == []
+
+
+@pytest.mark.parametrize("folder", [".", "notebooks"], ids=["from the root", "as JupyterLab"])
+@pytest.mark.parametrize("name", NAMES)
+def test_runs_by_hand(tmp_path, name, folder):
+    parameters = yaml.safe_dump(SMOKE.get(name, {}))
+    done = papermill(name, tmp_path / "out.ipynb", "--cwd", folder, "-y", parameters)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_misspelt_parameter_is_an_error(tmp_path, name):
+    done = papermill(name, tmp_path / "out.ipynb", "-p", "num_rums", "3")
+    assert done.returncode != 0
+    errors = [line for line in done.stderr.splitlines() if "Error: " in line]
+    assert any("num_rums" in line for line in errors), done.stderr

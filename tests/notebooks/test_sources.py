@@ -1,0 +1,52 @@
+"""Notebooks are committed as sources: nothing in them comes from a run."""
+
+from pathlib import Path
+
+import nbformat
+import pytest
+import yaml
+
+NOTEBOOKS = Path(__file__).resolve().parents[2] / "notebooks"
+SOURCES = [path for path in sorted(NOTEBOOKS.rglob("*.ipynb")) if "checkpoint" not in path.name]
+
+
+@pytest.fixture(params=SOURCES, ids=lambda path: path.stem)
+def notebook(request):
+    return nbformat.read(request.param, as_version=4)
+
+
+def test_has_no_outputs(notebook):
+    code = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    assert [cell.source for cell in code if cell.outputs or cell.execution_count] == []
+
+
+def test_has_no_traces_of_a_run(notebook):
+    assert "papermill" not in notebook.metadata
+    for cell in notebook.cells:
+        assert not {"papermill", "execution", "collapsed"} & cell.metadata.keys(), cell.source
+
+
+def test_has_one_parameters_cell(notebook):
+    tagged = [cell for cell in notebook.cells if "parameters" in cell.metadata.get("tags", [])]
+    assert [cell.cell_type for cell in tagged] == ["code"]
+
+
+def test_runs_on_the_environment_of_the_book(notebook):
+    assert notebook.metadata.kernelspec.name == "python3"
+
+
+def test_cells_have_ids_of_their_own(notebook):
+    assert notebook.nbformat_minor >= 5
+    ids = [cell.id for cell in notebook.cells]
+    assert len(ids) == len(set(ids))
+
+
+def test_begins_with_a_title(notebook):
+    assert notebook.cells[0].cell_type == "markdown"
+    assert "# " in notebook.cells[0].source
+
+
+@pytest.mark.parametrize("profile", ["smoke", "class", "paper"])
+def test_every_profile_names_existing_notebooks(profile):
+    parameters = yaml.safe_load((NOTEBOOKS / "profiles" / f"{profile}.yml").read_text())
+    assert parameters.keys() <= {path.stem for path in SOURCES}

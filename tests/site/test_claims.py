@@ -1,0 +1,193 @@
+"""The verdicts follow the rows: each flips when the numbers do, and none stands without data."""
+
+from __future__ import annotations
+
+import inspect
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import claims
+
+PLAIN = {2: (35.3, 35.3), 5: (32.7, 32.8), 10: (32.2, 32.2)}  # gradient descent, IPO
+
+
+def rows(method, num_domains, dim_distractor, mean, optimizer="adam", spread=0.3) -> list[tuple]:
+    """Ten runs of a cell around a mean."""
+    cell = (method, num_domains, dim_distractor, optimizer)
+    values = mean + np.linspace(-spread, spread, 10)
+    return [(*cell, run, "test", "test_cost", value) for run, value in enumerate(values)]
+
+
+def write(data: Path, name: str, lines: list[tuple]) -> None:
+    path = data / "results" / f"{name}.csv"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pd.DataFrame(lines, columns=claims.RESULT_COLUMNS).to_csv(path, index=False)
+
+
+def edit(data: Path, name: str, change) -> None:
+    """Pass the rows of a result through a function."""
+    path = data / "results" / f"{name}.csv"
+    change(pd.read_csv(path)).to_csv(path, index=False)
+
+
+def verdict(data: Path, name: str) -> str:
+    return claims.decide_all(data)[name].verdict
+
+
+@pytest.fixture
+def empty(tmp_path) -> Path:
+    """The claims and the paper's numbers, but no results."""
+    shutil.copytree(claims.DATA / "paper", tmp_path / "paper")
+    shutil.copy(claims.DATA / "claims.yml", tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def data(empty) -> Path:
+    """Results with exactly the paper's means, a gap that closes, and no gap under plain steps."""
+    tables = []
+    for cell in claims.load_paper("lqr", empty).itertuples(index=False, name="PaperCell"):
+        optimizer = "none" if cell.method == "oracle" else "adam"
+        tables += rows(cell.method, cell.num_domains, cell.dim_distractor, cell.mean, optimizer)
+    write(empty, "lqr/tables", tables)
+    more = rows("ipo_fixed_phi", 20, 1000, 36.0) + rows("ipo_fixed_phi", 50, 1000, 33.0)
+    write(empty, "lqr/more_domains", more)
+    write_plain(empty, PLAIN)
+    return empty
+
+
+def write_plain(data: Path, costs: dict[int, tuple[float, float]]) -> None:
+    lines = []
+    for number, (baseline, ipo) in costs.items():
+        lines += rows("gradient_descent", number, 1000, baseline, "plain")
+        lines += rows("ipo_fixed_phi", number, 1000, ipo, "plain")
+    write(data, "lqr/optimizers", lines)
+
+
+def test_without_results_there_is_no_verdict(empty):
+    assert {finding.verdict for finding in claims.decide_all(empty).values()} == {claims.NO_DATA}
+    claims.write_fragments(empty, empty)  # and the pages still come
+
+
+def test_a_cell_with_a_missing_run_does_not_count(data):
+    edit(data, "lqr/tables", lambda table: table.drop(index=0))
+    finding = claims.decide_all(data)["lqr-numbers"]
+    assert finding.verdict == claims.NO_DATA
+    assert "9 of 10 runs" in finding.evidence
+
+
+def test_a_missing_column_is_an_error_that_names_it(data):
+    edit(data, "lqr/tables", lambda table: table.drop(columns="optimizer"))
+    with pytest.raises(ValueError, match=r"tables\.csv.*optimizer"):
+        claims.decide_all(data)
+
+
+@pytest.mark.parametrize(
+    ("shift", "of", "expected"),
+    [
+        (0.0, "every cell", claims.REPRODUCED),
+        (0.1, "every cell", claims.REPRODUCED),
+        (0.5, "one cell", claims.IN_PART),
+        (2.0, "every cell", claims.NOT_SUPPORTED),
+    ],
+)
+def test_numbers_come_back_or_not(data, shift, of, expected):
+    def change(table):
+        table.loc[table.index < (10 if of == "one cell" else len(table)), "value"] += shift
+        return table
+
+    edit(data, "lqr/tables", change)
+    assert verdict(data, "lqr-numbers") == expected
+
+
+@pytest.mark.parametrize(
+    ("added", "expected"),
+    [(0.0, claims.REPRODUCED), (10.0, claims.IN_PART), (100.0, claims.NOT_SUPPORTED)],
+)
+def test_better_than_gradient_descent(data, added, expected):
+    def change(table):
+        table.loc[table.method == "ipo_fixed_phi", "value"] += added
+        return table
+
+    edit(data, "lqr/tables", change)
+    assert verdict(data, "lqr-better-than-gradient-descent") == expected
+
+
+def test_overparameterised_wins_one_configuration_in_the_paper_itself(data):
+    finding = claims.decide_all(data)["lqr-better-than-both-baselines"]
+    assert finding.verdict == claims.IN_PART
+    assert "34 of 36" in finding.evidence
+    assert "6.2 higher than overparameterised at 5 domains, 100 distractors" in finding.evidence
+
+
+def test_a_difference_within_the_noise_is_not_significant(data):
+    def change(table):
+        chosen = table.method.str.startswith("ipo") & (table.run % 2 == 0)
+        table.loc[chosen, "value"] += 1000.0
+        table.loc[table.method.str.startswith("ipo") & (table.run % 2 == 1), "value"] -= 1000.0
+        return table
+
+    edit(data, "lqr/tables", change)  # the means are as before
+    assert verdict(data, "lqr-better-than-gradient-descent") == claims.REPRODUCED
+    assert verdict(data, "lqr-better-than-both-baselines") == claims.NOT_SUPPORTED
+
+
+@pytest.mark.parametrize(
+    ("at_20", "at_50", "expected"),
+    [
+        (36.0, 33.0, claims.REPRODUCED),
+        (42.0, 41.0, claims.IN_PART),
+        (44.0, 33.0, claims.NOT_SUPPORTED),
+    ],
+)
+def test_towards_the_oracle(data, at_20, at_50, expected):
+    more = rows("ipo_fixed_phi", 20, 1000, at_20) + rows("ipo_fixed_phi", 50, 1000, at_50)
+    write(data, "lqr/more_domains", more)
+    assert verdict(data, "lqr-more-domains") == expected
+
+
+@pytest.mark.parametrize(
+    ("costs", "expected"),
+    [
+        (PLAIN, claims.NOT_SUPPORTED),
+        ({2: (60, 40), 5: (60, 40), 10: (60, 40)}, claims.REPRODUCED),
+        ({2: (60, 40), 5: (32.7, 32.8), 10: (32.2, 32.2)}, claims.IN_PART),
+    ],
+)
+def test_the_gap_survives_plain_steps_or_not(data, costs, expected):
+    write_plain(data, costs)
+    assert verdict(data, "lqr-because-of-the-game") == expected
+
+
+def test_the_first_page_shows_the_numbers_of_the_rows(data, tmp_path):
+    def change(table):
+        chosen = (table.num_domains == 5) & (table.dim_distractor == 1000)
+        table.loc[chosen & (table.method == "ipo_fixed_phi"), "value"] += 1.0
+        return table
+
+    edit(data, "lqr/tables", change)
+    claims.write_fragments(tmp_path, data)
+    found = (tmp_path / "_generated" / "found.md").read_text(encoding="utf-8")
+    assert "52.3<br>" in found  # the paper's
+    assert "53.3<br>" in found  # ours, one higher
+    assert "1 not supported" in found
+
+
+def test_the_page_of_claims_has_every_claim(data, tmp_path):
+    claims.write_fragments(tmp_path, data)
+    page = (tmp_path / "_generated" / "claims.md").read_text(encoding="utf-8")
+    for claim in claims.read_claims(data)["claims"]:
+        assert f"({claim['id']})=" in page
+        assert claim["where"] in page
+
+
+@pytest.mark.parametrize("claim", claims.read_claims()["claims"], ids=lambda claim: claim["id"])
+def test_every_claim_names_a_rule_and_its_settings(claim):
+    parameters = list(inspect.signature(claims.RULES[claim["rule"]]).parameters)
+    assert parameters[2:] == list(claim["settings"])
+    texts = {"id", "chapter", "title", "claim", "where", "test"}
+    assert claim.keys() == texts | {"results", "rule", "settings"}

@@ -1,0 +1,242 @@
+"""The built site, as a reader meets it: opened from a folder and served, on a wide and a narrow
+screen, in light and dark mode."""
+
+from __future__ import annotations
+
+import re
+from urllib.parse import urldefrag, urlsplit
+
+import pytest
+from browse import PHONE, Visit, new_context, open_page, visit
+
+# Contrast of every piece of visible text with the background that it stands on (WCAG 2).
+TEXT_CONTRAST = """() => {
+  const linear = (c) => c <= .04045 ? c / 12.92 : ((c + .055) / 1.055) ** 2.4;
+  const channel = (c) => linear(c / 255);
+  const luminance = ([r, g, b]) => .2126 * channel(r) + .7152 * channel(g) + .0722 * channel(b);
+  const parse = (text) => text.match(/[\\d.]+/g).map(Number);
+  const background = (e) => {
+    for (; e; e = e.parentElement) {
+      const colour = parse(getComputedStyle(e).backgroundColor);
+      if (colour.length < 4 || colour[3] === 1) return colour;
+    }
+    return [255, 255, 255];
+  };
+  const selector = 'h1, h2, h3, p, li, td, th, a, figcaption, .sd-badge, .caption-text, pre';
+  return [...document.querySelectorAll('.bd-article :is(' + selector + ')')]
+    .filter(e => e.offsetParent && e.innerText.trim() && !e.classList.contains('headerlink'))
+    .map(e => {
+      const pair = [parse(getComputedStyle(e).color), background(e)].map(luminance);
+      const contrast = (Math.max(...pair) + .05) / (Math.min(...pair) + .05);
+      return {text: e.tagName + ' ' + e.innerText.slice(0, 40), contrast};
+    });
+}"""
+READABLE = 4.5  # WCAG AA for text
+
+
+def anchors(visits: dict[str, Visit]) -> set[tuple[str, str]]:
+    return {(name, anchor) for name, seen in visits.items() for anchor in seen.content["ids"]}
+
+
+def broken_links(seen: Visit, visits: dict[str, Visit], built_site) -> list[str]:
+    """Links into the site that lead to no file or to no element."""
+    home, known = seen.url.rsplit("/", 1)[0], anchors(visits)
+    broken = []
+    for link in seen.content["links"]:
+        url, anchor = urldefrag(link)
+        if urlsplit(link).scheme not in ("file", "http", "https") or not url.startswith(home):
+            continue
+        path = urlsplit(url.removeprefix(home)).path.lstrip("/")
+        found = (built_site / path).is_file()
+        if not found or (anchor and path.endswith(".html") and (path, anchor) not in known):
+            broken.append(link)
+    return broken
+
+
+def bad_images(seen: Visit) -> list[dict]:
+    """Images that did not load, or whose text says nothing or only repeats the file's name."""
+    return [
+        image
+        for image in seen.content["images"]
+        if not image["loaded"]
+        or not image["alt"].strip()
+        or re.search(r"\.(png|jpe?g|svg|gif|webp)$", image["alt"])
+    ]
+
+
+def bad_equations(seen: Visit) -> list[str]:
+    """Mathematics that MathJax did not set, set twice, or set as an error."""
+    content = seen.content
+    wrong = content["unrendered"] + content["math_errors"]
+    if content["equations"] != content["math"]:
+        wrong.append(f"{content['math']} pieces of mathematics, {content['equations']} equations")
+    return wrong
+
+
+def bad_figures(seen: Visit) -> list[dict]:
+    return [
+        figure
+        for figure in seen.content["figures"]
+        if not re.search(r"\d", figure["number"]) or not figure["caption"]
+    ]
+
+
+def by_page(check, visits: dict[str, Visit]) -> dict:
+    """What a check finds, for the pages on which it finds something."""
+    return {name: found for name, seen in visits.items() if (found := check(seen))}
+
+
+# --- each page -----------------------------------------------------------------------------------
+
+
+def test_the_site_has_its_pages(page_names):
+    expected = {"index.html", "intro.html", "claims.html", "references.html", "run_times.html"}
+    assert expected <= set(page_names)
+
+
+def test_nothing_comes_from_outside(visits):
+    assert all(seen.requests for seen in visits.values())
+    assert not by_page(Visit.external_requests, visits)
+
+
+def test_no_request_fails(visits):
+    assert not by_page(lambda seen: seen.failures, visits)
+
+
+def test_the_console_is_silent(visits):
+    assert not by_page(lambda seen: seen.errors, visits)
+
+
+def test_every_internal_link_leads_somewhere(visits, built_site):
+    assert not by_page(lambda seen: broken_links(seen, visits, built_site), visits)
+
+
+def test_every_image_loads_and_says_what_it_shows(visits):
+    assert not by_page(bad_images, visits)
+
+
+def test_every_equation_is_set(visits):
+    assert any(seen.content["equations"] for seen in visits.values())
+    assert not by_page(bad_equations, visits)
+
+
+def test_every_figure_has_a_number_of_its_own_and_a_caption(visits):
+    assert not by_page(bad_figures, visits)
+    figures = [
+        (name, figure["number"])
+        for name, seen in visits.items()
+        if name != "index.html"  # shows the first page
+        for figure in seen.content["figures"]
+    ]
+    assert figures
+    assert len(figures) == len(set(figures))
+
+
+def test_no_page_scrolls_sideways_on_a_phone(phone_visits):
+    widths = {name: seen.content["width"] for name, seen in phone_visits.items()}
+    assert {name: width for name, width in widths.items() if width > PHONE["width"]} == {}
+
+
+# --- finding and reading -------------------------------------------------------------------------
+
+
+def search_results(context, address: str, words: str) -> list[str]:
+    page = context.new_page()
+    open_page(page, f"{address}/search.html?q={words}")
+    page.wait_for_selector("#search-results p.search-summary")
+    page.wait_for_function(
+        "/found|did not match/.test(document.querySelector('p.search-summary').innerText)"
+    )
+    links = page.eval_on_selector_all("#search-results li a", "all => all.map(a => a.href)")
+    page.close()
+    return [urlsplit(link).path.rsplit("/", 1)[-1] for link in links]
+
+
+def test_search_finds_a_word_and_only_where_it_is(browser, address):
+    with new_context(browser) as context:
+        assert "lqr.html" in search_results(context, address, "distractors")
+        assert search_results(context, address, "zyxwvut") == []
+
+
+def test_the_search_field_leads_to_the_results(browser, address):
+    with new_context(browser) as context:
+        page = context.new_page()
+        open_page(page, f"{address}/intro.html")
+        page.keyboard.press("Control+K")
+        page.keyboard.type("distractors")
+        page.keyboard.press("Enter")
+        page.wait_for_url("**/search.html?q=distractors*")
+        page.wait_for_selector("#search-results li a")
+
+
+def switch_to(page, mode: str) -> None:
+    for _ in range(3):  # automatic, dark, light
+        if page.evaluate("document.documentElement.dataset.mode") == mode:
+            return
+        page.click(".theme-switch-button:visible")
+    pytest.fail(f"the switch does not lead to {mode} mode")
+
+
+@pytest.mark.parametrize("mode", ["light", "dark"])
+def test_text_is_readable_in_both_modes(browser, built_site, page_names, mode):
+    with new_context(browser) as context:
+        page = context.new_page()
+        open_page(page, f"{built_site.as_uri()}/intro.html")
+        switch_to(page, mode)
+        faint = {}
+        for name in page_names:
+            open_page(page, f"{built_site.as_uri()}/{name}")  # the choice stays
+            assert page.evaluate("document.documentElement.dataset.theme") == mode
+            texts = page.evaluate(TEXT_CONTRAST)
+            faint[name] = [text for text in texts if text["contrast"] < READABLE]
+        assert {name: texts for name, texts in faint.items() if texts} == {}
+
+
+def test_dark_mode_is_dark_and_figures_stand_on_white(browser, built_site):
+    with new_context(browser) as context:
+        page = context.new_page()
+        open_page(page, f"{built_site.as_uri()}/lqr.html")
+        switch_to(page, "dark")
+        background = page.evaluate("getComputedStyle(document.body).backgroundColor")
+        assert max(int(part) for part in re.findall(r"\d+", background)) < 64
+        cards = page.eval_on_selector_all(
+            ".bd-article figure img", "all => all.map(i => getComputedStyle(i).backgroundColor)"
+        )
+        assert cards
+        assert set(cards) == {"rgb(255, 255, 255)"}
+
+
+def test_paper_gets_the_article_alone(browser, built_site):
+    with new_context(browser) as context:
+        page = context.new_page()
+        page.emulate_media(media="print")
+        open_page(page, f"{built_site.as_uri()}/intro.html")
+        assert page.is_visible(".bd-article")
+        assert not page.is_visible(".bd-sidebar-primary")
+
+
+# --- the checks themselves -----------------------------------------------------------------------
+
+BROKEN_PAGE = """<!doctype html><title>Broken</title><body class="bd-article">
+<script src="https://cdn.invalid/library.js"></script>
+<script>console.error("oh"); undefinedName;</script>
+<img src="missing.png" alt="">
+<a href="nowhere.html">one</a> <a href="broken.html#nothing">two</a>
+<span class="math">\\(x\\)</span>
+<figure><figcaption>No number</figcaption></figure>
+<table><tr><td style="min-width: 2000px">wide</td></tr></table>"""
+
+
+def test_the_checks_find_the_faults_of_a_broken_page(browser, tmp_path):
+    (tmp_path / "broken.html").write_text(BROKEN_PAGE)
+    with new_context(browser, PHONE) as context:
+        seen = visit(context, f"{tmp_path.as_uri()}/broken.html")
+    assert seen.external_requests() == ["https://cdn.invalid/library.js"]
+    assert any(url.endswith("missing.png") for url in seen.failures)
+    assert any("oh" in error for error in seen.errors)
+    assert any("undefinedName" in error for error in seen.errors)
+    assert len(broken_links(seen, {"broken.html": seen}, tmp_path)) == 2
+    assert bad_images(seen)
+    assert bad_equations(seen)
+    assert bad_figures(seen)
+    assert seen.content["width"] > PHONE["width"]

@@ -1,0 +1,274 @@
+"""The build, on a toy project of two notebooks: what it executes, refuses, keeps and hides."""
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import nbformat
+import pytest
+from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
+
+import claims
+from build import main
+from execute import load_notebooks, tree_hash
+from ipo import provenance
+
+PROFILES = {
+    "class": "plain: {num_runs: 3}\n",
+    "unknown_notebook": "plane: {num_runs: 3}\n",
+    "unknown_parameter": "plain: {num_rums: 3}\n",
+    "no_mapping": "- plain\n",
+    "no_parameters": "plain: 3\n",
+}
+FILES = {
+    "_config.yml": "title: A toy\nexecute: {execute_notebooks: 'off'}\n",
+    "_toc.yml": "format: jb-book\nroot: intro\nchapters: [{file: plain}, {file: painted}, "
+    "{file: run_times}]\n",
+    "environment.txt": "numpy==2\n",
+    "book/intro.md": "# A toy\n\nSee [](plain.ipynb).\n",
+    "data/paper/table.csv": "1\n",
+    "data/results/plain/rows.csv": "1\n",
+    "ipo/__init__.py": "",
+    "ipo/colors.py": 'from ipo import shades\n\nRED = f"{shades.DARK} red"\n',
+    "ipo/shades.py": 'DARK = "dark"\n',
+} | {f"notebooks/profiles/{name}.yml": text for name, text in PROFILES.items()}
+CELLS = {
+    "plain": [
+        ("num_runs = 10", "parameters"),
+        ("import sys, warnings\nprint(num_runs, 'runs')\nwarnings.warn('careful')", ""),
+        ("import pandas as pd\npd.DataFrame({'a': [1]}).style", ""),
+        ("print('1 of 3', file=sys.stderr)\nprint('done')", "progress"),
+    ],
+    "painted": [("size = 1", "parameters"), ("from ipo import colors\ncolors.RED", "")],
+}
+
+
+def write_notebook(root: Path, name: str, cells: list, text: str = "A toy.") -> None:
+    kernel = {"name": "python3", "display_name": "Python 3", "language": "python"}
+    notebook = new_notebook(metadata={"kernelspec": kernel})
+    notebook.cells = [new_markdown_cell(f"# {name}\n\n{text}")] + [
+        new_code_cell(source, metadata={"tags": [tag]} if tag else {}) for source, tag in cells
+    ]
+    for number, cell in enumerate(notebook.cells):
+        cell.id = f"cell-{number}"
+    nbformat.write(notebook, root / "notebooks" / f"{name}.ipynb")
+
+
+@pytest.fixture(scope="module")
+def built_toy(tmp_path_factory) -> Path:
+    root = tmp_path_factory.mktemp("built") / "toy"
+    for path, text in FILES.items():
+        (root / path).parent.mkdir(parents=True, exist_ok=True)
+        (root / path).write_text(text)
+    for name, cells in CELLS.items():
+        write_notebook(root, name, cells)
+    with pytest.MonkeyPatch.context() as patch:
+        in_toy(patch, root)
+        assert main([], root) == 0
+    return root
+
+
+@pytest.fixture
+def toy(built_toy, tmp_path, monkeypatch) -> Path:
+    """A copy of the built toy project, to be changed."""
+    root = tmp_path / "toy"
+    shutil.copytree(built_toy, root)
+    in_toy(monkeypatch, root)
+    return root
+
+
+def in_toy(patch: pytest.MonkeyPatch, root: Path) -> None:
+    """The toy's own package, and no claims."""
+    patch.setattr(provenance, "PACKAGE", root / "ipo")
+    patch.setattr(claims, "write_fragments", lambda folder: None)
+
+
+def executed(root: Path, name: str) -> Path:
+    return root / "book" / "_executed" / "class" / name
+
+
+def outdated(root: Path) -> set[str]:
+    notebooks = load_notebooks(root, "class", executed(root, ""))
+    return {notebook.name for notebook in notebooks if not notebook.is_current()}
+
+
+# ------------------------------------------------------------------------- what is executed
+
+
+def test_second_build_does_nothing(toy, capsys):
+    before = tree_hash(toy / "book")
+    assert main([], toy) == 0
+    assert capsys.readouterr().out.count("unchanged") == 3  # two notebooks and the site
+    assert tree_hash(toy / "book") == before
+
+
+@pytest.mark.parametrize(
+    ("path", "text", "expected"),
+    [
+        ("environment.txt", "numpy==3\n", {"plain", "painted"}),
+        ("data/paper/table.csv", "2\n", {"plain", "painted"}),
+        ("data/results/plain/rows.csv", "2\n", {"plain"}),
+        ("data/results/plain/more.csv", "2\n", {"plain"}),
+        ("notebooks/profiles/class.yml", "plain: {num_runs: 4}\n", {"plain"}),
+        ("ipo/colors.py", 'from ipo import shades\n\nRED = "red"\n', {"painted"}),
+        ("ipo/shades.py", 'DARK = "light"\n', {"painted"}),
+        ("ipo/shades.py", '"""Shades."""\n\nDARK = "dark"  # a comment\n', set()),
+        ("book/intro.md", "# Another toy\n", set()),
+    ],
+)
+def test_only_what_depends_on_a_change_is_outdated(toy, path, text, expected):
+    assert outdated(toy) == set()
+    (toy / path).write_text(text)
+    assert outdated(toy) == expected
+
+
+def test_changed_code_executes_its_notebook_only(toy, capsys):
+    other = executed(toy, "plain.ipynb").read_bytes()
+    write_notebook(toy, "painted", [*CELLS["painted"], ("print('new ' * 2)", "")])
+    assert main([], toy) == 0
+    assert "notebooks/plain.ipynb    unchanged" in capsys.readouterr().out
+    assert "new new" in executed(toy, "painted.ipynb").read_text()
+    assert "new new" in (toy / "book/_build/html/painted.html").read_text()
+    assert executed(toy, "plain.ipynb").read_bytes() == other
+
+
+def test_changed_text_reaches_the_site_without_execution(toy, capsys):
+    write_notebook(toy, "plain", CELLS["plain"], text="Better said.")
+    assert main([], toy) == 0
+    assert capsys.readouterr().out.count("unchanged") == 2
+    page = (toy / "book/_build/html/plain.html").read_text()
+    assert "Better said." in page and "3 runs" in page
+
+
+def test_one_chapter_builds_no_site(toy, capsys):
+    executed(toy, "painted.json").unlink()
+    site = tree_hash(toy / "book/_build")
+    assert main(["--chapter", "painted"], toy) == 0
+    assert "plain" not in capsys.readouterr().out
+    assert tree_hash(toy / "book/_build") == site
+
+
+# ---------------------------------------------------------------------- what an execution leaves
+
+
+def test_executing_again_gives_the_same_file(toy):
+    before = executed(toy, "plain.ipynb").read_bytes()
+    executed(toy, "plain.json").unlink()
+    assert main(["--chapter", "plain"], toy) == 0
+    assert executed(toy, "plain.ipynb").read_bytes() == before
+
+
+def test_times_and_places_stay_out_of_the_executed_copy(built_toy):
+    text = executed(built_toy, "plain.ipynb").read_text()
+    traces = ("papermill", "_time", "iopub", str(built_toy), "ipykernel_")
+    assert [trace for trace in traces if trace in text] == []
+    record = json.loads(executed(built_toy, "plain.json").read_text())
+    assert record["seconds"] > 0
+    assert [cell["first_line"] for cell in record["cells"]][:2] == [
+        "num_runs = 10",
+        "import sys, warnings",
+    ]
+    assert sorted(path.name for path in executed(built_toy, "").iterdir()) == sorted(
+        f"{name}.{kind}" for name in CELLS for kind in ("ipynb", "json")
+    )
+
+
+def test_injected_parameters_are_hidden_and_kept(built_toy):
+    cells = nbformat.read(executed(built_toy, "plain.ipynb"), as_version=4).cells
+    assert cells[2].metadata.tags == ["injected-parameters", "remove-cell"]
+    assert "num_runs = 3" in cells[2].source
+    assert "num_runs = 3" not in (built_toy / "book/_build/html/plain.html").read_text()
+
+
+def test_progress_bars_are_dropped_and_warnings_kept(built_toy):
+    cells = nbformat.read(executed(built_toy, "plain.ipynb"), as_version=4).cells
+    assert [output.name for output in cells[5].outputs] == ["stdout"]
+    assert "<cell>:3: UserWarning: careful" in cells[3].outputs[1].text
+
+
+def test_page_of_run_times(built_toy):
+    page = (built_toy / "book/_build/html/run_times.html").read_text()
+    for expected in ('href="plain.html"', 'href="painted.html"', "colors</span>"):
+        assert expected in page
+
+
+# -------------------------------------------------------------------------------- what fails
+
+
+def test_failing_notebook_ends_the_build_and_leaves_the_last_good_one(toy, capsys):
+    site = tree_hash(toy / "book/_build")
+    copy = executed(toy, "painted.ipynb").read_bytes()
+    write_notebook(toy, "painted", [*CELLS["painted"], ("# why not\nsize / 0", "")])
+    write_notebook(toy, "plain", [*CELLS["plain"], ("print('finished')", "")])
+    assert main([], toy) == 1
+    error = capsys.readouterr().err
+    assert "painted, cell 4 failed: size / 0" in error
+    assert "ZeroDivisionError: division by zero" in error
+    assert "\x1b" not in error
+    assert "ZeroDivisionError" in executed(toy, "painted.failed.ipynb").read_text()
+    assert executed(toy, "painted.ipynb").read_bytes() == copy
+    assert tree_hash(toy / "book/_build") == site
+    assert "finished" in executed(toy, "plain.ipynb").read_text()
+
+    write_notebook(toy, "painted", CELLS["painted"])
+    assert main([], toy) == 0
+
+
+def test_dying_kernel_names_its_cell(toy, capsys):
+    cells = [("size = 1", "parameters"), ("import os\nos.kill(os.getpid(), 9)", ""), ("size", "")]
+    write_notebook(toy, "painted", cells)
+    assert main(["--chapter", "painted"], toy) == 1
+    error = capsys.readouterr().err
+    assert "painted, cell 3 failed: import os" in error
+    assert "Kernel died" in error
+
+
+def test_warning_of_the_site_ends_the_build_and_leaves_the_last_good_one(toy, capsys):
+    pages = tree_hash(toy / "book/_build/html")
+    (toy / "book/intro.md").write_text("# A toy\n\nSee {doc}`nowhere`.\n")
+    assert main([], toy) == 1
+    assert "nowhere" in capsys.readouterr().err
+    assert tree_hash(toy / "book/_build/html") == pages
+    assert main([], toy) == 1  # and it is not forgotten
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["--profile", "clas"], "no profile 'clas'; the profiles are class"),
+        (["--profile", "unknown_notebook"], "names plane, but the notebooks in _toc.yml are"),
+        (["--profile", "unknown_parameter"], "gives plain the parameter num_rums"),
+        (["--profile", "no_mapping"], "must map notebooks to parameters"),
+        (["--profile", "no_parameters"], "must map notebooks to parameters"),
+        (["--chapter", "plane"], "no chapter 'plane'; the chapters are plain, painted"),
+    ],
+)
+def test_bad_requests_are_refused_before_any_work(toy, capsys, arguments, expected):
+    before = tree_hash(toy / "book")
+    assert main(arguments, toy) == 1
+    assert expected in capsys.readouterr().err
+    assert tree_hash(toy / "book") == before
+
+
+@pytest.mark.parametrize("jobs", ["0", "-1", "two"])
+def test_number_of_jobs_is_checked(toy, capsys, jobs):
+    with pytest.raises(SystemExit):
+        main(["--jobs", jobs], toy)
+    assert "--jobs" in capsys.readouterr().err
+
+
+# -------------------------------------------------------------------------------- set-up
+
+
+def test_missing_system_packages_are_named_and_never_fail(tmp_path):
+    """Without apt-get and without the right to install: one command to type, and the loss."""
+    script = Path(__file__).resolve().parents[1] / "book" / "setup.py"
+    code = f"import runpy; runpy.run_path({str(script)!r})['install_system_packages']()"
+    done = subprocess.run(
+        [sys.executable, "-c", code], env={"PATH": str(tmp_path)}, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    assert "sudo apt-get install --yes --no-install-recommends chromium" in done.stdout
+    assert "in a browser" in done.stdout
