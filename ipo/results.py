@@ -23,6 +23,7 @@ from typing import Any, Protocol
 
 import joblib
 import pandas as pd
+from filelock import FileLock
 from tqdm import tqdm
 
 from ipo.checks import check_counts
@@ -92,7 +93,7 @@ def run_or_load(
         jobs = (joblib.delayed(_timed)(run, cell, lacking) for cell, lacking in missing)
         work = joblib.Parallel(n_jobs=num_workers, return_as="generator_unordered")(jobs)
         for cell, new_rows, cost in tqdm(work, desc=name, total=len(missing), unit="cell"):
-            store.add(new_rows, _batch(cell, new_rows, today, cost))
+            store.add(cell, new_rows, today, cost)
         rows, batches = store.read()
     wanted = rows[rows["run"].isin(seeds)]
     parts = [_select(wanted, cell.columns) for cell in cells]
@@ -126,7 +127,7 @@ class _Store:
             return pd.DataFrame({"run": pd.Series(dtype=int)}), []
         try:
             batches = json.loads(self.json.read_text())["batches"]
-            rows = pd.read_csv(self.csv, dtype={"domain": str}, float_precision="round_trip")
+            rows = pd.read_csv(self.csv, dtype={"domain": str})
         except (ValueError, KeyError, OSError) as error:
             raise ResultsError(f"{self.json.with_suffix('')}: cannot be read: {error}") from error
         for batch in batches:
@@ -148,16 +149,23 @@ class _Store:
             )
         return part
 
-    def add(self, new_rows: pd.DataFrame, batch: dict[str, Any]) -> None:
-        """Add one batch. Reads the files again first, so that two writers lose nothing."""
-        rows, batches = self.read()
-        batches = [*batches, batch]
-        rows = pd.concat([rows, new_rows]) if len(rows) else new_rows
-        order = [column for column in new_rows.columns if column != "value"]
-        rows = rows.sort_values(order, kind="stable")[list(new_rows.columns)]
-        batches.sort(key=lambda batch: json.dumps([batch["columns"], batch["seeds"]]))
-        _replace(self.csv, rows.to_csv(index=False))
-        _replace(self.json, json.dumps({"batches": batches}, indent=1) + "\n")
+    def add(self, cell: Cell, new_rows: pd.DataFrame, today: str, cost: dict[str, float]) -> None:
+        """Add the rows of one cell. Two programs may fill the same files at the same time.
+
+        Runs that the other one has added in the meantime are kept as they are.
+        """
+        with FileLock(self.csv.with_suffix(".lock")):
+            rows, batches = self.read()
+            new_rows = new_rows[new_rows["run"].isin(_lacking(cell, new_rows["run"], batches))]
+            if new_rows.empty:
+                return
+            batches = [*batches, _batch(cell, new_rows, today, cost)]
+            order = [column for column in new_rows.columns if column != "value"]
+            rows = pd.concat([rows, new_rows]) if len(rows) else new_rows
+            rows = rows.sort_values(order, kind="stable")[list(new_rows.columns)]
+            batches.sort(key=lambda batch: json.dumps([batch["columns"], batch["seeds"]]))
+            _replace(self.csv, rows.to_csv(index=False))
+            _replace(self.json, json.dumps({"batches": batches}, indent=1) + "\n")
 
     def check_writable(self) -> None:
         try:
