@@ -88,10 +88,14 @@ def observations(panels: dict[str, np.ndarray], dim_state: int) -> Figure:
         ax.set(title=title, xlabel="time step")
         ax.grid(False)
     axes[0, 0].set_ylabel("observation $o_t$")
-    axes[0, 0].text(0.98, dim_state / 2, "$W_c s$: state", ha="right", va="center",
-                    transform=axes[0, 0].get_yaxis_transform(), bbox=_box())  # fmt: skip
-    axes[0, 0].text(0.98, (dim_state + panel.shape[1]) / 2, "$W_d s$: distractor", ha="right",
-                    va="center", transform=axes[0, 0].get_yaxis_transform(), bbox=_box())  # fmt: skip
+    middles = {"$W_c s$: state": dim_state / 2}
+    middles["$W_d s$: distractor"] = (dim_state + panel.shape[1]) / 2
+    for text, middle in middles.items():
+        axes[0, 0].text(
+            0.98, middle, text, ha="right", va="center",
+            transform=axes[0, 0].get_yaxis_transform(),
+            bbox={"facecolor": "white", "alpha": 0.85, "edgecolor": "none", "pad": 2},
+        )  # fmt: skip
     fig.colorbar(picture, ax=axes[0], label="value", shrink=0.8)
     return fig
 
@@ -108,7 +112,3 @@ def trajectories(energies: dict[str, np.ndarray], oracle: str) -> Figure:
     ax.set(yscale="log", xlabel="time step", ylabel="$|s_t|^2$", ylim=(1e-6, None))
     ax.legend()
     return fig
-
-
-def _box() -> dict[str, object]:
-    return {"facecolor": "white", "alpha": 0.85, "edgecolor": "none", "pad": 2}
