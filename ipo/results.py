@@ -59,6 +59,7 @@ def run_or_load(
     run: Callable[[Cell, list[int]], pd.DataFrame],
     modules: Sequence[str],
     num_workers: int | None = None,
+    runs_at_once: int | None = None,
     allow_stale: bool = False,
 ) -> pd.DataFrame:
     """The rows of ``cells`` x ``seeds``: loaded where they exist, computed where they do not.
@@ -70,9 +71,10 @@ def run_or_load(
         run: ``run(cell, seeds)`` returns the rows, with the cell's columns and ``run``.
         modules: the ``ipo`` modules whose source decides the rows.
         num_workers: processes that compute; ``None`` leaves it to ``joblib.parallel_config``.
+        runs_at_once: how many runs of a cell are computed, and saved, together; ``None``: all.
         allow_stale: use stale rows with a :class:`StaleResultsWarning` instead of an error.
 
-    Every finished cell is saved at once: after an interruption the next call goes on with
+    Every finished batch is saved at once: after an interruption the next call goes on with
     what is missing and ends with the same rows.
 
     Raises:
@@ -87,12 +89,16 @@ def run_or_load(
         store, [s for cell in cells for s in _staleness(cell, batches, today)], allow_stale
     )
 
-    missing = [(cell, lacking) for cell in cells if (lacking := _lacking(cell, seeds, batches))]
+    size = runs_at_once or len(seeds)
+    lacking = [(cell, _lacking(cell, seeds, batches)) for cell in cells]
+    missing = [
+        (cell, runs[i : i + size]) for cell, runs in lacking for i in range(0, len(runs), size)
+    ]
     if missing:
         store.check_writable()
-        jobs = (joblib.delayed(_timed)(run, cell, lacking) for cell, lacking in missing)
+        jobs = (joblib.delayed(_timed)(run, cell, runs) for cell, runs in missing)
         work = joblib.Parallel(n_jobs=num_workers, return_as="generator_unordered")(jobs)
-        for cell, new_rows, cost in tqdm(work, desc=name, total=len(missing), unit="cell"):
+        for cell, new_rows, cost in tqdm(work, desc=name, total=len(missing), unit="batch"):
             store.add(cell, new_rows, today, cost)
         rows, batches = store.read()
     wanted = rows[rows["run"].isin(seeds)]

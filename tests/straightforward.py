@@ -1,4 +1,4 @@
-"""The LQR experiment written the obvious way: the oracle of the tests and the baseline of the bench.
+"""The LQR problem and IPO with fixed Phi, slow and obvious: the yardstick for ``ipo.lqr``.
 
 One run at a time, automatic differentiation, and the Lyapunov equation as one linear system
 of n_x^2 unknowns. Shares no code with ``ipo``; meant to be checked by reading.
