@@ -1,0 +1,70 @@
+"""The shipped rows of Tables 1 and 2: complete, of today's code, and the paper's to the digit."""
+
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from ipo.lqr_experiments import MODULES
+from ipo.results import provenance, stale_batches
+
+DATA = Path(__file__).resolve().parents[2] / "data"
+RESULTS = DATA / "results" / "lqr"
+CONFIGURATION = ["method", "num_domains", "dim_distractor"]
+SIZES = [(n_d, 1000) for n_d in (2, 3, 4, 5, 10)] + [(5, n_y) for n_y in (100, 500, 1500, 2000)]
+# How far a mean may be from the paper's. The paper gives one decimal; where the start of Phi,
+# or of the two layers, is not published, there is more to allow for.
+BOUNDS = {
+    "gradient_descent": 0.15,
+    "ipo_fixed_phi": 0.15,
+    "overparameterized": 1.5,
+    "ipo_variable_phi": 1.5,
+    "oracle": 0.05,
+}
+UNREACHED = pytest.mark.xfail(strict=True, reason="no reading of the unpublished start reaches it")
+
+
+@pytest.fixture(scope="module")
+def costs() -> pd.DataFrame:
+    rows = pd.read_csv(RESULTS / "tables.csv")
+    return rows[rows["metric"] == "test_cost"]
+
+
+@pytest.fixture(scope="module")
+def means(costs) -> pd.Series:
+    return costs.groupby(CONFIGURATION)["value"].mean()
+
+
+@pytest.fixture(scope="module")
+def paper() -> pd.DataFrame:
+    """Both tables; the configuration that stands in both has the same numbers in both."""
+    table = pd.read_csv(DATA / "paper" / "lqr.csv").drop(columns="table").drop_duplicates()
+    return table.set_index(CONFIGURATION)
+
+
+CELLS = [
+    pytest.param(
+        (method, *sizes),
+        marks=UNREACHED if (method, *sizes) == ("ipo_variable_phi", 5, 100) else (),
+        id=f"{method}-{sizes[0]}-{sizes[1]}",
+    )
+    for method in BOUNDS
+    for sizes in SIZES
+]
+
+
+@pytest.mark.parametrize("cell", CELLS)
+def test_mean_is_the_papers(means, paper, cell):
+    assert abs(means[cell] - paper["mean"][cell]) <= BOUNDS[cell[0]]
+
+
+def test_every_cell_has_ten_runs(costs):
+    counted = costs.groupby(CONFIGURATION)["run"].apply(sorted)
+    expected = {(method, *sizes): list(range(10)) for method in BOUNDS for sizes in SIZES}
+    assert counted.to_dict() == expected
+
+
+@pytest.mark.parametrize("name", sorted(path.stem for path in RESULTS.glob("*.json")))
+def test_rows_are_whole_and_come_from_todays_code(name):
+    assert provenance(RESULTS, name)
+    assert stale_batches(RESULTS, name, MODULES) == []
