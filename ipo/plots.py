@@ -20,6 +20,9 @@ STYLES = {
     "ipo_variable_phi": ("IPO, variable Φ", "#56B4E9", "v"),
     "minimum_norm": ("minimum norm, closed form", "#009E73", "D"),
     "oracle": ("oracle", "#000000", "_"),
+    "ppo": ("PPO", "#D55E00", "o"),
+    "ipo": ("IPO", "#0072B2", "^"),
+    "ensemble": ("ensemble, pooled data", "#E69F00", "s"),
 }
 
 STYLE = {
@@ -74,6 +77,18 @@ def draw_paper(ax: Axes, paper: pd.DataFrame, x: str, methods: Sequence[str]) ->
 
 def draw_oracle(ax: Axes, cost: float) -> None:
     ax.axhline(cost, color="black", lw=1, ls="--", label="oracle")
+
+
+def draw_runs(ax: Axes, values: dict[str, np.ndarray]) -> None:
+    """Every run of every method as a point, and the mean with its 95 % interval as a bar."""
+    rng = np.random.default_rng(0)
+    for column, runs in enumerate(values.values()):
+        ax.scatter(column + rng.uniform(-0.2, 0.2, len(runs)), runs, s=12, alpha=0.45, lw=0)
+        low, high = bootstrap_interval(runs, rng)
+        ax.plot([column + 0.3] * 2, [low, high], color="black", lw=2)
+        ax.plot(column + 0.3, runs.mean(), color="black", marker="o", ms=5)
+    ax.set_xticks(range(len(values)), [name.replace(", ", ",\n") for name in values])
+    ax.grid(axis="x", visible=False)
 
 
 def observations(panels: dict[str, np.ndarray], dim_state: int) -> Figure:

@@ -1,7 +1,7 @@
 """Statistics over runs: intervals, paired differences, probability of improvement.
 
 All methods see the same seeds, so comparisons are paired. Intervals are bootstrap intervals
-over runs; with ten runs a nominal 95 % covers a little less (92 to 93 % for the IQM).
+over runs; with few runs they are a little too narrow.
 """
 
 from __future__ import annotations

@@ -1,0 +1,209 @@
+"""Networks for many runs at once: every weight has a leading run axis R, and layers are ``bmm``.
+
+A network is a function ``network(weights, observations) -> (logits, values)`` of one player's
+weights ``{name: [R, ...]}``. Players are kept apart as a list of such weights; their average acts
+(Section 4 and the appendix of the paper):
+
+    logits = (1 / E) sum_d logits_d,    value = (1 / E) sum_d value_d
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import safetensors
+import safetensors.torch
+import torch
+from torch import Tensor
+
+from ipo.game import average
+
+PIECE = 256  # rows of a table that are evaluated together
+
+Weights = dict[str, Tensor]
+Outputs = tuple[Tensor, Tensor]
+
+
+class GridNetwork:
+    """The actor-critic of the published runs for MiniGrid's 7x7 view (appendix, Fig. 6).
+
+    Three 2x2 convolutions (16, 32, 64 channels) with ReLU, max-pooling after the first; then an
+    actor and a critic, each with one hidden layer of 64 tanh units.
+
+    Args:
+        num_channels: of the image; 3 for MiniGrid's codes of object, colour and state.
+        num_actions: A.
+    """
+
+    def __init__(self, num_channels: int = 3, num_actions: int = 7) -> None:
+        self.shapes = {
+            "conv1": (4 * num_channels, 16),
+            "conv2": (4 * 16, 32),
+            "conv3": (4 * 32, 64),
+            "actor1": (64, 64),
+            "actor2": (64, num_actions),
+            "critic1": (64, 64),
+            "critic2": (64, 1),
+        }
+
+    def start(self, generators: Sequence[np.random.Generator]) -> Weights:
+        """Random weights, one run for each generator, in the manner of the published runs.
+
+        Convolutions are uniform within ``1 / sqrt(inputs)``; in dense layers the weights of each
+        unit are a random direction of length 1, and biases are zero.
+        """
+        runs = [self._draw(generator) for generator in generators]
+        return {
+            name: torch.tensor(np.stack([run[name] for run in runs]), dtype=torch.float32)
+            for name in runs[0]
+        }
+
+    def _draw(self, generator: np.random.Generator) -> dict[str, np.ndarray]:
+        weights = {}
+        for name, (num_inputs, num_units) in self.shapes.items():
+            if name.startswith("conv"):
+                bound = 1 / math.sqrt(num_inputs)
+                matrix = generator.uniform(-bound, bound, (num_inputs, num_units))
+                bias = generator.uniform(-bound, bound, num_units)
+            else:
+                matrix = generator.standard_normal((num_inputs, num_units))
+                matrix /= np.linalg.norm(matrix, axis=0)
+                bias = np.zeros(num_units)
+            weights[f"{name}.weight"], weights[f"{name}.bias"] = matrix, bias
+        return weights
+
+    def __call__(self, weights: Weights, images: Tensor) -> Outputs:
+        """``images [R, B, 7, 7, C]`` -> logits ``[R, B, A]``, values ``[R, B]``."""
+
+        def layer(name: str, x: Tensor) -> Tensor:
+            bias = weights[f"{name}.bias"].unsqueeze(1)
+            y = torch.baddbmm(bias, x.flatten(1, -2), weights[f"{name}.weight"])
+            return y.reshape(*x.shape[:-1], -1)
+
+        x = _max_pool(layer("conv1", _patches(images))).relu()  # [R, B, 3, 3, 16]
+        x = layer("conv2", _patches(x)).relu()  # [R, B, 2, 2, 32]
+        x = layer("conv3", _patches(x)).relu().flatten(2)  # [R, B, 64]
+        logits = layer("actor2", layer("actor1", x).tanh())
+        values = layer("critic2", layer("critic1", x).tanh())
+        return logits, values.squeeze(-1)
+
+    def frozen(self, players: Sequence[Weights]) -> Callable[[Tensor], Outputs]:
+        """The average that acts, without gradients, as a function of images."""
+
+        @torch.no_grad()
+        def policy(images: Tensor) -> Outputs:
+            logits, values = zip(*(self(player, images) for player in players), strict=True)
+            return average(torch.stack(logits, 1)), average(torch.stack(values, 1))
+
+        return policy
+
+
+class OnTable:
+    """A network whose observations are indices of rows in a table of K distinct ones.
+
+    The network is evaluated once for each row that occurs, not once for each occurrence.
+    """
+
+    def __init__(self, network: GridNetwork, table: Tensor) -> None:
+        self.network, self.table = network, table
+
+    def __call__(self, weights: Weights, indices: Tensor) -> Outputs:
+        """``indices [R, B]`` -> logits ``[R, B, A]``, values ``[R, B]``."""
+        rows, position = _distinct(indices, len(self.table))
+        logits, values = self.network(weights, self.table[rows])
+        return _take(logits, position), values.gather(1, position)
+
+    def average(self, players: Sequence[Weights]) -> Outputs:
+        """What the players' average makes of the whole table: ``[R, K, A]`` and ``[R, K]``."""
+        num_runs = next(iter(players[0].values())).shape[0]
+        policy = self.network.frozen(players)
+        # In pieces, which stay in the processor's cache.
+        pieces = [policy(x.expand(num_runs, *x.shape)) for x in self.table.split(PIECE)]
+        logits, values = zip(*pieces, strict=True)
+        return torch.cat(logits, 1), torch.cat(values, 1)
+
+    def frozen(self, players: Sequence[Weights]) -> Callable[[Tensor], Outputs]:
+        """The average of ``players`` as they are now, as a function of ``indices [R, B]``."""
+        logits, values = self.average(players)
+        return lambda indices: (_take(logits, indices), values.gather(1, indices))
+
+
+def save_policy(path: str | Path, players: Sequence[Weights], about: dict[str, Any]) -> None:
+    """Write the weights of all players and runs to a file that loads without executing code."""
+    tensors = {
+        f"{d}.{name}": weight.detach().contiguous()
+        for d, player in enumerate(players)
+        for name, weight in player.items()
+    }
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_suffix(".partial")
+    safetensors.torch.save_file(tensors, partial, {"about": json.dumps(about)})
+    partial.replace(path)
+
+
+def load_policy(
+    path: str | Path, network: GridNetwork, about: dict[str, Any] | None = None
+) -> tuple[list[Weights], dict[str, Any]]:
+    """Weights of every player and run, and what the file says about them.
+
+    Raises:
+        ValueError: a file that is cut short, that holds weights of another network or NaN, or
+            that was not made for ``about``.
+    """
+    try:
+        with safetensors.safe_open(path, "pt") as file:
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            found = json.loads(file.metadata()["about"])
+    except (safetensors.SafetensorError, TypeError, KeyError) as error:
+        raise ValueError(f"{path}: cannot be read as a policy: {error}") from error
+    for name, value in (about or {}).items():
+        if found.get(name) != value:
+            raise ValueError(f"{path}: was made for {name} = {found.get(name)!r}, not {value!r}")
+    num_players = 1 + max(int(name.split(".")[0]) for name in tensors)
+    shapes = {f"{layer}.weight": shape for layer, shape in network.shapes.items()}
+    shapes |= {f"{layer}.bias": shape[1:] for layer, shape in network.shapes.items()}
+    players: list[Weights] = [{} for _ in range(num_players)]
+    for d, player in enumerate(players):
+        for name, shape in shapes.items():
+            weight = tensors.get(f"{d}.{name}")
+            if weight is None or tuple(weight.shape[1:]) != shape:
+                have = "nothing" if weight is None else tuple(weight.shape[1:])
+                raise ValueError(f"{path}: {name} of player {d} has shape {have}, needs {shape}")
+            if not bool(torch.isfinite(weight).all()):
+                raise ValueError(f"{path}: {name} of player {d} holds NaN or infinite weights")
+            player[name] = weight
+    return players, found
+
+
+def _patches(x: Tensor) -> Tensor:
+    """All 2x2 neighbourhoods, ``[R, B, h, w, c] -> [R, B, h - 1, w - 1, 4 c]``."""
+    corners = (x[:, :, :-1, :-1], x[:, :, :-1, 1:], x[:, :, 1:, :-1], x[:, :, 1:, 1:])
+    return torch.cat(corners, dim=-1)
+
+
+def _max_pool(x: Tensor) -> Tensor:
+    """Maximum over disjoint 2x2 squares, ``[R, B, h, w, c] -> [R, B, h / 2, w / 2, c]``."""
+    rows = torch.maximum(x[:, :, ::2], x[:, :, 1::2])
+    return torch.maximum(rows[:, :, :, ::2], rows[:, :, :, 1::2])
+
+
+def _distinct(indices: Tensor, num_rows: int) -> tuple[Tensor, Tensor]:
+    """Rows ``[R, U]`` that occur in ``indices [R, B]`` of each run, and the place of each index.
+
+    Runs with fewer than U rows are filled up with rows that nobody asks for.
+    """
+    occurs = torch.zeros(len(indices), num_rows, dtype=torch.int64).scatter_(1, indices, 1)
+    num_distinct = int(occurs.sum(1).max())
+    rows = occurs.argsort(dim=1, descending=True, stable=True)[:, :num_distinct]
+    return rows, (occurs.cumsum(1) - 1).gather(1, indices)
+
+
+def _take(table: Tensor, position: Tensor) -> Tensor:
+    """Rows of ``table [R, U, A]`` at ``position [R, B]``: ``[R, B, A]``."""
+    return table.gather(1, position.unsqueeze(-1).expand(-1, -1, table.shape[-1]))
