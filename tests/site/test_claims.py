@@ -11,7 +11,18 @@ import pandas as pd
 import pytest
 
 import claims
+from rules import RULES
 
+COLUMNS = [
+    "method",
+    "num_domains",
+    "dim_distractor",
+    "optimizer",
+    "run",
+    "domain",
+    "metric",
+    "value",
+]
 PLAIN = {2: (35.3, 35.3), 5: (32.7, 32.8), 10: (32.2, 32.2)}  # gradient descent, IPO
 
 
@@ -25,7 +36,7 @@ def rows(method, num_domains, dim_distractor, mean, optimizer="adam", spread=0.3
 def write(data: Path, name: str, lines: list[tuple]) -> None:
     path = data / "results" / f"{name}.csv"
     path.parent.mkdir(parents=True, exist_ok=True)
-    pd.DataFrame(lines, columns=claims.RESULT_COLUMNS).to_csv(path, index=False)
+    pd.DataFrame(lines, columns=COLUMNS).to_csv(path, index=False)
 
 
 def edit(data: Path, name: str, change) -> None:
@@ -187,7 +198,7 @@ def test_the_page_of_claims_has_every_claim(data, tmp_path):
 
 @pytest.mark.parametrize("claim", claims.read_claims()["claims"], ids=lambda claim: claim["id"])
 def test_every_claim_names_a_rule_and_its_settings(claim):
-    parameters = list(inspect.signature(claims.RULES[claim["rule"]]).parameters)
+    parameters = list(inspect.signature(RULES[claim["rule"]]).parameters)
     assert parameters[2:] == list(claim["settings"])
     texts = {"id", "chapter", "title", "claim", "where", "test"}
     assert claim.keys() == texts | {"results", "rule", "settings"}
