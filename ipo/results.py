@@ -30,6 +30,8 @@ from ipo.checks import check_counts
 from ipo.provenance import source_hash
 
 VERSIONS = ("torch", "numpy", "scipy", "pandas")
+BATCH_KEYS = {"columns", "cell", "seeds", "num_rows", "sha256", "source_hash"}
+NO_ROWS = pd.DataFrame({"run": pd.Series(dtype=int)})
 
 
 class ResultsError(ValueError):
@@ -130,12 +132,17 @@ class _Store:
                 raise ResultsError(
                     f"{self.csv}: has no {self.json.name} beside it that says where it comes from"
                 )
-            return pd.DataFrame({"run": pd.Series(dtype=int)}), []
+            return NO_ROWS, []
         try:
             batches = json.loads(self.json.read_text())["batches"]
-            rows = pd.read_csv(self.csv, dtype={"domain": str})
-        except (ValueError, KeyError, OSError) as error:
+            for batch in batches:
+                if absent := BATCH_KEYS - batch.keys():
+                    raise KeyError(f"a batch without {min(absent)}")
+            rows = pd.read_csv(self.csv, dtype={"domain": str}) if batches else NO_ROWS
+        except (ValueError, KeyError, TypeError, AttributeError, OSError) as error:
             raise ResultsError(f"{self.json.with_suffix('')}: cannot be read: {error}") from error
+        if not batches:  # killed before the first batch was saved whole
+            return NO_ROWS, []
         for batch in batches:
             needed = [*batch["columns"], "run", "domain", "metric", "value"]
             absent = [column for column in needed if column not in rows.columns]
@@ -170,8 +177,13 @@ class _Store:
             rows = pd.concat([rows, new_rows]) if len(rows) else new_rows
             rows = rows.sort_values(order, kind="stable")[list(new_rows.columns)]
             batches.sort(key=lambda batch: json.dumps([batch["columns"], batch["seeds"]]))
+            if not self.json.exists():  # a CSV without a JSON would be somebody else's
+                self._write_batches([])
             _replace(self.csv, rows.to_csv(index=False))
-            _replace(self.json, json.dumps({"batches": batches}, indent=1) + "\n")
+            self._write_batches(batches)
+
+    def _write_batches(self, batches: list[dict[str, Any]]) -> None:
+        _replace(self.json, json.dumps({"batches": batches}, indent=1) + "\n")
 
     def check_writable(self) -> None:
         try:

@@ -29,7 +29,7 @@ from ipo.lqr_learners import METHODS, published, train, trained_gain
 from ipo.optimizers import make_optimizer
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-import straightforward  # noqa: E402
+import straightforward
 
 SEEDS = list(range(10))
 SIZES = {"num_domains": 5, "dim_distractor": 1000}
