@@ -14,8 +14,9 @@ from minigrid.core.constants import OBJECT_TO_IDX
 
 from ipo.checks import check_choice
 from ipo.colored_keys import COLORS, ColoredKeysEnv
+from ipo.distributions import Categorical
 from ipo.networks import GridNetwork, OnTable, Weights, save_policy
-from ipo.ppo import Settings, entropy, sample, train
+from ipo.ppo import Settings, train
 from ipo.tabular import TabularDomains, TabularTask, expected_return, load_or_tabulate, reach
 
 MODULES = ("keys_experiments",)
@@ -136,7 +137,7 @@ def exact(task: Keys, players: Sequence[Weights]) -> dict[tuple[str, str], np.nd
         metrics[color, "return_greedy"], _ = expected_return(table, greedy)
         metrics[color, "reaches_key"] = reach(table, policy, table.progress >= 1)
         metrics[color, "unlocks_door"] = reach(table, policy, table.progress >= 2)
-        metrics[color, "entropy"] = entropy(logits).mean(1).numpy()
+        metrics[color, "entropy"] = Categorical.entropy(logits).mean(1).numpy()
     return metrics
 
 
@@ -169,7 +170,7 @@ def published_protocol(
     total = np.zeros(len(generators))
     while (running := episodes < NUM_EPISODES).any():
         rows = observation.unsqueeze(-1).expand(-1, -1, logits.shape[-1])
-        step = copies.step(sample(logits.gather(1, rows), generators))
+        step = copies.step(Categorical.sample(logits.gather(1, rows), generators))
         ended = (step.terminated | step.truncated).sum(1).numpy()
         episodes += running * ended
         total += running * step.reward.sum(1).numpy()

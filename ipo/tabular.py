@@ -22,8 +22,8 @@ from minigrid.minigrid_env import MiniGridEnv
 from torch import Tensor
 from tqdm import tqdm
 
-from ipo.ppo import Step
 from ipo.provenance import source_hash
+from ipo.rollouts import Step
 
 
 class NotTabularError(ValueError):
@@ -183,14 +183,17 @@ class TabularDomains:
         self.starts = np.cumsum(np.concatenate([task.start for task in tasks]))
 
     def __call__(
-        self, domains: Sequence[int], num_copies: int, generators: Sequence[np.random.Generator]
+        self,
+        domains: Sequence[int],
+        num_copies: Sequence[int],
+        generators: Sequence[np.random.Generator],
     ) -> TabularEnvironments:
-        """``num_copies`` copies of each of ``domains``, for one run per generator."""
+        """``num_copies`` of each of ``domains``, for one run per generator."""
         return TabularEnvironments(self, np.repeat(domains, num_copies), generators)
 
 
 class TabularEnvironments:
-    """``[R, N]`` copies that begin anew when they end (the interface of ``ppo.Environments``)."""
+    """``[R, N]`` copies that begin anew when they end: ``rollouts.Environments``."""
 
     def __init__(
         self,
