@@ -79,15 +79,20 @@ def draw_oracle(ax: Axes, cost: float) -> None:
     ax.axhline(cost, color="black", lw=1, ls="--", label="oracle")
 
 
-def draw_runs(ax: Axes, values: dict[str, np.ndarray]) -> None:
-    """Every run of every method as a point, and the mean with its 95 % interval as a bar."""
+def draw_runs(ax: Axes, values: dict[str, np.ndarray], names: dict[str, str]) -> None:
+    """Every run of every arm as a point, and the mean with its 95 % interval as a bar.
+
+    An arm has the colour of its method, which its key begins with: ``ppo_lr5e-4``.
+    """
     rng = np.random.default_rng(0)
-    for column, runs in enumerate(values.values()):
-        ax.scatter(column + rng.uniform(-0.2, 0.2, len(runs)), runs, s=12, alpha=0.45, lw=0)
+    for column, (arm, runs) in enumerate(values.items()):
+        color = STYLES[arm.split("_")[0]][1]
+        place = column + rng.uniform(-0.2, 0.2, len(runs))
+        ax.scatter(place, runs, s=12, alpha=0.5, lw=0, color=color)
         low, high = bootstrap_interval(runs, rng)
         ax.plot([column + 0.3] * 2, [low, high], color="black", lw=2)
         ax.plot(column + 0.3, runs.mean(), color="black", marker="o", ms=5)
-    ax.set_xticks(range(len(values)), [name.replace(", ", ",\n") for name in values])
+    ax.set_xticks(range(len(values)), [names[arm].replace(", ", ",\n") for arm in values])
     ax.grid(axis="x", visible=False)
 
 
