@@ -10,11 +10,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import torch
+from minigrid.core.constants import OBJECT_TO_IDX
 
 from ipo.checks import check_choice
 from ipo.colored_keys import COLORS, ColoredKeysEnv
+from ipo.distributions import Categorical
 from ipo.networks import GridNetwork, OnTable, Weights, save_policy
-from ipo.ppo import Settings, entropy, sample, train
+from ipo.ppo import Settings, train
 from ipo.tabular import TabularDomains, TabularTask, expected_return, load_or_tabulate, reach
 
 MODULES = ("keys_experiments",)
@@ -109,12 +111,12 @@ class Keys:
         num_domains = len(cell.train_colors)
         return train(network, self.network.start, domains, num_domains, cell.settings, seeds)
 
-    def logits(self, players: Sequence[Weights], color: str) -> torch.Tensor:
-        """Of the average policy ``[R, K, A]``, by observation of a colour's domain.
+    def logits(self, players: Sequence[Weights], images: np.ndarray) -> torch.Tensor:
+        """Of the average policy ``[R, K, A]`` for MiniGrid's ``images [K, 7, 7, 3]``.
 
         In double precision, so that a saved policy has the same return on every machine.
         """
-        images = encode(self.tasks[color].images, self.color_encoding)
+        images = encode(images, self.color_encoding)
         doubled = [{name: w.double() for name, w in player.items()} for player in players]
         return OnTable(self.network, images.double()).average(doubled)[0]
 
@@ -128,14 +130,14 @@ def exact(task: Keys, players: Sequence[Weights]) -> dict[tuple[str, str], np.nd
     """
     metrics = {}
     for color, table in task.tasks.items():
-        logits = task.logits(players, color)
+        logits = task.logits(players, table.images)
         policy = logits.softmax(-1).numpy()
         greedy = np.eye(policy.shape[-1])[policy.argmax(-1)]
         metrics[color, "return_exact"], metrics[color, "success"] = expected_return(table, policy)
         metrics[color, "return_greedy"], _ = expected_return(table, greedy)
         metrics[color, "reaches_key"] = reach(table, policy, table.progress >= 1)
         metrics[color, "unlocks_door"] = reach(table, policy, table.progress >= 2)
-        metrics[color, "entropy"] = entropy(logits).mean(1).numpy()
+        metrics[color, "entropy"] = Categorical.entropy(logits).mean(1).numpy()
     return metrics
 
 
@@ -145,7 +147,7 @@ def evaluate(
     """:func:`exact`, and the published protocol beside it."""
     metrics = exact(task, players)
     for color, table in task.tasks.items():
-        logits = task.logits(players, color)
+        logits = task.logits(players, table.images)
         generators = [np.random.default_rng([seed, COLORS.index(color)]) for seed in seeds]
         metrics[color, "return_published_protocol"] = published_protocol(table, logits, generators)
     return metrics
@@ -168,7 +170,7 @@ def published_protocol(
     total = np.zeros(len(generators))
     while (running := episodes < NUM_EPISODES).any():
         rows = observation.unsqueeze(-1).expand(-1, -1, logits.shape[-1])
-        step = copies.step(sample(logits.gather(1, rows), generators))
+        step = copies.step(Categorical.sample(logits.gather(1, rows), generators))
         ended = (step.terminated | step.truncated).sum(1).numpy()
         episodes += running * ended
         total += running * step.reward.sum(1).numpy()
@@ -186,6 +188,14 @@ def encode(images: np.ndarray, color_encoding: str) -> torch.Tensor:
         return others
     codes = torch.nn.functional.one_hot(images[..., COLOR_CHANNEL].long(), len(COLORS))
     return torch.cat([others, codes.float()], dim=-1)
+
+
+def recolor(images: np.ndarray, codes: dict[str, int]) -> np.ndarray:
+    """Images with another colour code for some kinds of object, such as ``{"key": 7}``."""
+    images = images.copy()
+    for kind, code in codes.items():
+        images[images[..., 0] == OBJECT_TO_IDX[kind], COLOR_CHANNEL] = code
+    return images
 
 
 def _rows(cell: Cell, seeds: list[int], metrics: dict[tuple[str, str], np.ndarray]) -> pd.DataFrame:

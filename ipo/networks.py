@@ -1,14 +1,16 @@
 """Networks for many runs at once: every weight has a leading run axis R, and layers are ``bmm``.
 
-A network is a function ``network(weights, observations) -> (logits, values)`` of one player's
-weights ``{name: [R, ...]}``. Players are kept apart as a list of such weights; their average acts
-(Section 4 and the appendix of the paper):
+A network is a function ``network(weights, observations) -> (parameters, values)`` of one player's
+weights ``{name: [R, ...]}``; the parameters are those of its ``distribution`` of actions, such as
+logits. Players are kept apart as a list of such weights; their average acts (Section 4 and the
+appendix of the paper):
 
-    logits = (1 / E) sum_d logits_d,    value = (1 / E) sum_d value_d
+    parameters = (1 / E) sum_d parameters_d,    value = (1 / E) sum_d value_d
 """
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 from collections.abc import Callable, Sequence
@@ -21,6 +23,8 @@ import safetensors.torch
 import torch
 from torch import Tensor
 
+from ipo.checks import check_count
+from ipo.distributions import Categorical, Distribution, Gaussian
 from ipo.game import average
 
 PIECE = 256  # rows of a table that are evaluated together
@@ -29,16 +33,64 @@ Weights = dict[str, Tensor]
 Outputs = tuple[Tensor, Tensor]
 
 
-class GridNetwork:
+class Network:
+    """What actor-critics share: layers by name, weights drawn run by run, the players' average.
+
+    Attributes:
+        distribution: what the outputs of the actor are parameters of.
+        shapes: ``{layer: (inputs, units)}``.
+    """
+
+    distribution: type[Distribution]
+    shapes: dict[str, tuple[int, int]]
+
+    @property
+    def weight_shapes(self) -> dict[str, tuple[int, ...]]:
+        """Of a player's weights in one run, by name."""
+        shapes = {f"{layer}.weight": shape for layer, shape in self.shapes.items()}
+        return shapes | {f"{layer}.bias": shape[1:] for layer, shape in self.shapes.items()}
+
+    def start(self, generators: Sequence[np.random.Generator]) -> Weights:
+        """Random weights, one run for each generator."""
+        runs = [self._draw(generator) for generator in generators]
+        return {
+            name: torch.tensor(np.stack([run[name] for run in runs]), dtype=torch.float32)
+            for name in runs[0]
+        }
+
+    def _draw(self, generator: np.random.Generator) -> dict[str, np.ndarray]:
+        raise NotImplementedError
+
+    def __call__(self, weights: Weights, observations: Tensor) -> Outputs:
+        raise NotImplementedError
+
+    def frozen(self, players: Sequence[Weights]) -> Callable[[Tensor], Outputs]:
+        """The average that acts, without gradients, as a function of observations."""
+
+        @torch.no_grad()
+        def policy(observations: Tensor) -> Outputs:
+            outputs = [self(player, observations) for player in players]
+            parameters, values = zip(*outputs, strict=True)
+            return average(torch.stack(parameters, 1)), average(torch.stack(values, 1))
+
+        return policy
+
+
+class GridNetwork(Network):
     """The actor-critic of the published runs for MiniGrid's 7x7 view (appendix, Fig. 6).
 
     Three 2x2 convolutions (16, 32, 64 channels) with ReLU, max-pooling after the first; then an
     actor and a critic, each with one hidden layer of 64 tanh units.
 
+    Convolutions start uniform within ``1 / sqrt(inputs)``; in dense layers the weights of each unit
+    start as a random direction of length 1, and biases are zero.
+
     Args:
         num_channels: of the image; 3 for MiniGrid's codes of object, colour and state.
         num_actions: A.
     """
+
+    distribution = Categorical
 
     def __init__(self, num_channels: int = 3, num_actions: int = 7) -> None:
         self.shapes = {
@@ -49,18 +101,6 @@ class GridNetwork:
             "actor2": (64, num_actions),
             "critic1": (64, 64),
             "critic2": (64, 1),
-        }
-
-    def start(self, generators: Sequence[np.random.Generator]) -> Weights:
-        """Random weights, one run for each generator, in the manner of the published runs.
-
-        Convolutions are uniform within ``1 / sqrt(inputs)``; in dense layers the weights of each
-        unit are a random direction of length 1, and biases are zero.
-        """
-        runs = [self._draw(generator) for generator in generators]
-        return {
-            name: torch.tensor(np.stack([run[name] for run in runs]), dtype=torch.float32)
-            for name in runs[0]
         }
 
     def _draw(self, generator: np.random.Generator) -> dict[str, np.ndarray]:
@@ -81,9 +121,7 @@ class GridNetwork:
         """``images [R, B, 7, 7, C]`` -> logits ``[R, B, A]``, values ``[R, B]``."""
 
         def layer(name: str, x: Tensor) -> Tensor:
-            bias = weights[f"{name}.bias"].unsqueeze(1)
-            y = torch.baddbmm(bias, x.flatten(1, -2), weights[f"{name}.weight"])
-            return y.reshape(*x.shape[:-1], -1)
+            return _dense(weights, name, x.flatten(1, -2)).reshape(*x.shape[:-1], -1)
 
         x = _max_pool(layer("conv1", _patches(images))).relu()  # [R, B, 3, 3, 16]
         x = layer("conv2", _patches(x)).relu()  # [R, B, 2, 2, 32]
@@ -92,15 +130,83 @@ class GridNetwork:
         values = layer("critic2", layer("critic1", x).tanh())
         return logits, values.squeeze(-1)
 
-    def frozen(self, players: Sequence[Weights]) -> Callable[[Tensor], Outputs]:
-        """The average that acts, without gradients, as a function of images."""
 
-        @torch.no_grad()
-        def policy(images: Tensor) -> Outputs:
-            logits, values = zip(*(self(player, images) for player in players), strict=True)
-            return average(torch.stack(logits, 1)), average(torch.stack(values, 1))
+class DenseNetwork(Network):
+    """A separate actor and critic of tanh layers, for observations that are vectors.
 
-        return policy
+    With the default sizes it is the network of the paper's door-opening runs. Weights start as
+    orthogonal matrices times sqrt(2), those of the actor's last layer times 1; biases start at 0.
+    The standard deviations of a Gaussian do not depend on the observation: their logarithms are
+    weights, which start at 0.
+
+    Args:
+        num_observations: length of an observation.
+        num_actions: A, of how many to choose or of how many numbers an action consists.
+        distribution: :class:`Categorical` or :class:`Gaussian`.
+        hidden: units of each hidden layer.
+    """
+
+    def __init__(
+        self,
+        num_observations: int,
+        num_actions: int,
+        distribution: type[Distribution] = Gaussian,
+        hidden: Sequence[int] = (64, 64),
+    ) -> None:
+        check_count("num_observations", num_observations)
+        check_count("num_actions", num_actions)
+        for units in hidden:
+            check_count("hidden", units)
+        self.distribution, self.num_actions = distribution, num_actions
+        self.layers: dict[str, list[str]] = {}
+        self.shapes = {}
+        for part, num_outputs in (("actor", num_actions), ("critic", 1)):
+            sizes = [num_observations, *hidden, num_outputs]
+            self.layers[part] = [f"{part}{i + 1}" for i in range(len(sizes) - 1)]
+            self.shapes |= zip(self.layers[part], itertools.pairwise(sizes), strict=True)
+
+    @property
+    def weight_shapes(self) -> dict[str, tuple[int, ...]]:
+        extra = {"log_std": (self.num_actions,)} if self.distribution is Gaussian else {}
+        return super().weight_shapes | extra
+
+    def _draw(self, generator: np.random.Generator) -> dict[str, np.ndarray]:
+        weights = {name: np.zeros(shape) for name, shape in self.weight_shapes.items()}
+        for layer, shape in self.shapes.items():
+            gain = 1.0 if layer == self.layers["actor"][-1] else math.sqrt(2)
+            weights[f"{layer}.weight"] = gain * _orthogonal(shape, generator)
+        return weights
+
+    def __call__(self, weights: Weights, observations: Tensor) -> Outputs:
+        """``observations [R, B, O]`` -> parameters ``[R, B, P]``, values ``[R, B]``."""
+
+        def outputs(part: str) -> Tensor:
+            x = observations
+            *hidden, last = self.layers[part]
+            for layer in hidden:
+                x = Tanh.apply(_dense(weights, layer, x))
+            return _dense(weights, last, x)
+
+        parameters, values = outputs("actor"), outputs("critic").squeeze(-1)
+        if self.distribution is Gaussian:
+            deviation = weights["log_std"].exp().unsqueeze(1)
+            parameters = torch.cat([parameters, deviation.expand_as(parameters)], -1)
+        return parameters, values
+
+
+class Tanh(torch.autograd.Function):
+    """The hyperbolic tangent by NumPy, which is ten times as fast as torch's on the CPU."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor) -> Tensor:
+        y = torch.from_numpy(np.tanh(x.detach().numpy()))
+        ctx.save_for_backward(y)
+        return y
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:
+        (y,) = ctx.saved_tensors
+        return gradient * (1 - y.square())
 
 
 class OnTable:
@@ -111,6 +217,7 @@ class OnTable:
 
     def __init__(self, network: GridNetwork, table: Tensor) -> None:
         self.network, self.table = network, table
+        self.distribution = network.distribution
 
     def __call__(self, weights: Weights, indices: Tensor) -> Outputs:
         """``indices [R, B]`` -> logits ``[R, B, A]``, values ``[R, B]``."""
@@ -148,7 +255,7 @@ def save_policy(path: str | Path, players: Sequence[Weights], about: dict[str, A
 
 
 def load_policy(
-    path: str | Path, network: GridNetwork, about: dict[str, Any] | None = None
+    path: str | Path, network: Network, about: dict[str, Any] | None = None
 ) -> tuple[list[Weights], dict[str, Any]]:
     """Weights of every player and run, and what the file says about them.
 
@@ -166,11 +273,9 @@ def load_policy(
         if found.get(name) != value:
             raise ValueError(f"{path}: was made for {name} = {found.get(name)!r}, not {value!r}")
     num_players = 1 + max(int(name.split(".")[0]) for name in tensors)
-    shapes = {f"{layer}.weight": shape for layer, shape in network.shapes.items()}
-    shapes |= {f"{layer}.bias": shape[1:] for layer, shape in network.shapes.items()}
     players: list[Weights] = [{} for _ in range(num_players)]
     for d, player in enumerate(players):
-        for name, shape in shapes.items():
+        for name, shape in network.weight_shapes.items():
             weight = tensors.get(f"{d}.{name}")
             if weight is None or tuple(weight.shape[1:]) != shape:
                 have = "nothing" if weight is None else tuple(weight.shape[1:])
@@ -179,6 +284,19 @@ def load_policy(
                 raise ValueError(f"{path}: {name} of player {d} holds NaN or infinite weights")
             player[name] = weight
     return players, found
+
+
+def _dense(weights: Weights, name: str, x: Tensor) -> Tensor:
+    """A layer by name: ``x [R, B, inputs] -> [R, B, units]``."""
+    return torch.baddbmm(weights[f"{name}.bias"].unsqueeze(1), x, weights[f"{name}.weight"])
+
+
+def _orthogonal(shape: tuple[int, int], generator: np.random.Generator) -> np.ndarray:
+    """A random matrix whose columns, or rows if those are fewer, are orthonormal; uniform."""
+    tall = generator.standard_normal((max(shape), min(shape)))
+    Q, R = np.linalg.qr(tall)
+    Q *= np.sign(np.diag(R))
+    return Q if shape[0] >= shape[1] else Q.T
 
 
 def _patches(x: Tensor) -> Tensor:

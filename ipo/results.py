@@ -63,6 +63,7 @@ def run_or_load(
     num_workers: int | None = None,
     runs_at_once: int | None = None,
     allow_stale: bool = False,
+    confirm: bool = False,
 ) -> pd.DataFrame:
     """The rows of ``cells`` x ``seeds``: loaded where they exist, computed where they do not.
 
@@ -75,18 +76,24 @@ def run_or_load(
         num_workers: processes that compute; ``None`` leaves it to ``joblib.parallel_config``.
         runs_at_once: how many runs of a cell are computed, and saved, together; ``None``: all.
         allow_stale: use stale rows with a :class:`StaleResultsWarning` instead of an error.
+        confirm: prove stale rows instead. One batch of every stale cell is computed again; where
+            it is the same to the last digit, the batches of that cell that came from the same code
+            and parameters count as today's, and their record keeps what it said before.
 
     Every finished batch is saved at once: after an interruption the next call goes on with
     what is missing and ends with the same rows.
 
     Raises:
         ResultsError: a file that is damaged, or a folder that cannot be written.
-        StaleResultsError: rows from other source code or parameters than today's.
+        StaleResultsError: rows from other source code or parameters than today's, or rows that
+            ``confirm`` finds to be different.
     """
     check_counts("seeds", seeds, minimum=0)
     store = _Store(Path(folder), name)
-    rows, batches = store.read()
     today = source_hash(modules)
+    if confirm:
+        _confirm(store, cells, run, today, num_workers)
+    rows, batches = store.read()
     _report_stale(
         store, [s for cell in cells for s in _staleness(cell, batches, today)], allow_stale
     )
@@ -185,6 +192,19 @@ class _Store:
     def _write_batches(self, batches: list[dict[str, Any]]) -> None:
         _replace(self.json, json.dumps({"batches": batches}, indent=1) + "\n")
 
+    def renew(self, proved: dict[str, Any], cell: Cell, today: str) -> None:
+        """Record that today's code and parameters give the rows of a batch."""
+        with FileLock(self.csv.with_suffix(".lock")):
+            _, batches = self.read()
+            origin = {key: proved[key] for key in ("columns", "cell", "source_hash")}
+            for batch in batches:
+                if {key: batch[key] for key in origin} == origin:
+                    earlier = batch.setdefault("earlier", [])
+                    earlier.append({key: origin[key] for key in ("cell", "source_hash")})
+                    earlier[-1]["proved_by_seeds"] = proved["seeds"]
+                    batch |= {"cell": asdict(cell), "source_hash": today}
+            self._write_batches(batches)
+
     def check_writable(self) -> None:
         try:
             self.csv.parent.mkdir(parents=True, exist_ok=True)
@@ -243,6 +263,34 @@ def _report_stale(store: _Store, reasons: list[str], allow_stale: bool) -> None:
     if not allow_stale:
         raise StaleResultsError(message)
     warnings.warn(message, StaleResultsWarning, stacklevel=3)
+
+
+def _confirm(
+    store: _Store, cells: Sequence[Cell], run: Callable, today: str, num_workers: int | None
+) -> None:
+    """Compute one batch of every stale cell again, and renew the cell where nothing differs."""
+    _, batches = store.read()
+    stale = [
+        (
+            cell,
+            [b for b in batches if b["columns"] == cell.columns and _staleness(cell, [b], today)],
+        )
+        for cell in cells
+    ]
+    first = [(cell, own[0]) for cell, own in stale if own]
+    jobs = (joblib.delayed(_proof)(run, cell, batch) for cell, batch in first)
+    work = joblib.Parallel(n_jobs=num_workers, return_as="generator")(jobs)
+    bar = tqdm(zip(first, work, strict=True), desc=f"{store.csv.stem}, proof", total=len(first))
+    for (cell, batch), digest in bar:
+        if digest != batch["sha256"]:
+            raise StaleResultsError(
+                f"{store.csv}: {cell.columns}, runs {batch['seeds']}: today's code gives other rows"
+            )
+        store.renew(batch, cell, today)
+
+
+def _proof(run: Callable, cell: Cell, batch: dict[str, Any]) -> str:
+    return _digest(_timed(run, cell, batch["seeds"])[1])
 
 
 def _timed(

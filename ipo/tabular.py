@@ -22,8 +22,8 @@ from minigrid.minigrid_env import MiniGridEnv
 from torch import Tensor
 from tqdm import tqdm
 
-from ipo.ppo import Step
 from ipo.provenance import source_hash
+from ipo.rollouts import Step
 
 
 class NotTabularError(ValueError):
@@ -44,6 +44,8 @@ class TabularTask:
         images: ``[K, height, width, channels]``, the distinct observations.
         progress: ``[S]``, how many of the task's steps are done, as ``env.progress`` counts them;
             zero where the environment does not.
+        position: ``[S, 2]``, the agent's column and row.
+        signature: ``[S]``, by which :func:`state_of` finds the state that MiniGrid is in.
     """
 
     next_state: np.ndarray
@@ -54,6 +56,8 @@ class TabularTask:
     observation: np.ndarray
     images: np.ndarray
     progress: np.ndarray
+    position: np.ndarray
+    signature: np.ndarray
 
     @property
     def horizon(self) -> int:
@@ -76,6 +80,7 @@ def tabulate(env: Env, max_states: int = 100_000) -> TabularTask:
     images: dict[bytes, int] = {}
     observation: list[int] = []
     progress: list[int] = []
+    position: list[tuple[int, int]] = []
 
     def visit(image: np.ndarray) -> int:
         """The index of the present state of ``env``, which is remembered if it is new."""
@@ -87,6 +92,7 @@ def tabulate(env: Env, max_states: int = 100_000) -> TabularTask:
             states.append(_snapshot(env))
             observation.append(images.setdefault(image.tobytes(), len(images)))
             progress.append(getattr(env, "progress", 0))
+            position.append(tuple(map(int, env.agent_pos)))
         return index[key]
 
     start: dict[int, float] = {}
@@ -116,7 +122,21 @@ def tabulate(env: Env, max_states: int = 100_000) -> TabularTask:
         observation=np.array(observation, dtype=np.int32),
         images=np.stack([np.frombuffer(i, dtype).reshape(shape) for i in images]),
         progress=np.array(progress),
+        position=np.array(position),
+        signature=np.array([_signature(key) for key in index], dtype=np.uint64),
     )
+
+
+def state_of(task: TabularTask, env: Env) -> int:
+    """The state of the table that a MiniGrid environment is in.
+
+    Raises:
+        ValueError: an environment of another task.
+    """
+    found = np.flatnonzero(task.signature == _signature(_key(env.unwrapped)))
+    if len(found) != 1:
+        raise ValueError(f"env = {env}: is in no state of this table")
+    return int(found[0])
 
 
 def load_or_tabulate(make_env: Callable[..., Env], folder: str | Path, **options) -> TabularTask:
@@ -163,14 +183,17 @@ class TabularDomains:
         self.starts = np.cumsum(np.concatenate([task.start for task in tasks]))
 
     def __call__(
-        self, domains: Sequence[int], num_copies: int, generators: Sequence[np.random.Generator]
+        self,
+        domains: Sequence[int],
+        num_copies: Sequence[int],
+        generators: Sequence[np.random.Generator],
     ) -> TabularEnvironments:
-        """``num_copies`` copies of each of ``domains``, for one run per generator."""
+        """``num_copies`` of each of ``domains``, for one run per generator."""
         return TabularEnvironments(self, np.repeat(domains, num_copies), generators)
 
 
 class TabularEnvironments:
-    """``[R, N]`` copies that begin anew when they end (the interface of ``ppo.Environments``)."""
+    """``[R, N]`` copies that begin anew when they end: ``rollouts.Environments``."""
 
     def __init__(
         self,
@@ -249,6 +272,23 @@ def reach(task: TabularTask, policy: np.ndarray, states: np.ndarray) -> np.ndarr
     return expected_return(goal, policy)[1] + float(task.start @ states)
 
 
+def occupancy(task: TabularTask, policy: np.ndarray) -> np.ndarray:
+    """Expected number of steps ``[P, S]`` that policies ``[P, K, A]`` spend in each state.
+
+    mu_(t+1)(s') = sum_(s, a) mu_t(s) pi(a | s) 1{not done},    summed over t < T
+    """
+    goes_on = policy[:, task.observation] * ~task.done  # [P, S, A]
+    present = np.tile(task.start, (len(policy), 1))
+    total = np.zeros_like(present)
+    for _ in range(task.horizon):
+        total += present
+        later = np.zeros_like(present)
+        for action, next_state in enumerate(task.next_state.T):
+            np.add.at(later, (slice(None), next_state), present * goes_on[..., action])
+        present = later
+    return total
+
+
 def optimal_policy(task: TabularTask) -> tuple[np.ndarray, float]:
     """Best action ``[T, S]`` for every step and state, and its expected return.
 
@@ -325,7 +365,13 @@ def _all_starts(env: Env):
 def _key(env: Env) -> Any:
     """What tells one state from another; MiniGrid's own hash leaves out what is carried."""
     carried = env.carrying.encode() if env.carrying else None
-    return tuple(map(int, env.agent_pos)), env.agent_dir, carried, env.grid.encode().tobytes()
+    pose = tuple(map(int, (*env.agent_pos, env.agent_dir)))
+    return pose, carried, env.grid.encode().tobytes()
+
+
+def _signature(key: Any) -> int:
+    """A number for a state that is the same in every process, unlike Python's hash."""
+    return int.from_bytes(hashlib.blake2b(repr(key).encode(), digest_size=8).digest())
 
 
 def _snapshot(env: Env) -> Any:

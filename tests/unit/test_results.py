@@ -294,6 +294,52 @@ def test_stale_rows_are_shown_on_request_with_a_warning(folder, new_code):
     assert len(warnings) == 1
 
 
+def test_stale_rows_are_proved_by_computing_a_batch_of_each_cell(tmp_path, monkeypatch):
+    fill(tmp_path, runs_at_once=2)
+    rows, old = contents(tmp_path)["toy.csv"], results.source_hash(["stats"])
+    monkeypatch.setattr(results, "source_hash", lambda modules: "today")
+    calls = Calls()
+    fill(tmp_path, run=calls, confirm=True)
+    assert calls.asked == [(cell, [0, 1]) for cell in CELLS]
+    assert contents(tmp_path)["toy.csv"] == rows
+    batches = results.provenance(tmp_path, "toy")
+    assert {batch["source_hash"] for batch in batches} == {"today"}
+    for batch in batches:
+        assert batch["earlier"] == [
+            {"cell": batch["cell"], "source_hash": old, "proved_by_seeds": [0, 1]}
+        ]
+    fill(tmp_path, run=calls, confirm=True)
+    assert len(calls.asked) == len(CELLS)  # nothing is left to prove
+
+
+def test_other_parameters_with_the_same_rows_are_proved_too(tmp_path):
+    def run(cell, seeds):  # does not look at the power
+        return toy_experiment.run(Cell(cell.method, cell.size), seeds)
+
+    fill(tmp_path, CELLS[:1])
+    other = Cell(CELLS[0].method, CELLS[0].size, power=0.25)
+    fill(tmp_path, [other], run=run, confirm=True)
+    (batch,) = results.provenance(tmp_path, "toy")
+    assert (batch["cell"]["power"], batch["earlier"][0]["cell"]["power"]) == (0.25, 0.5)
+    with pytest.raises(StaleResultsError, match=r"power = 0\.25, asked for 0\.5"):
+        fill(tmp_path, CELLS[:1])
+
+
+def test_other_rows_are_no_proof(folder, new_code):
+    def run(cell, seeds):
+        rows = toy_experiment.run(cell, seeds)
+        return rows.assign(value=rows["value"] * (1 + 1e-6 * (cell.size == 2)))
+
+    before = contents(folder)["toy.csv"]
+    with pytest.raises(
+        StaleResultsError, match=r"'fast', 'size': 2}, runs \[0, 1, 2\].*other rows"
+    ):
+        fill(folder, [CELLS[1], CELLS[2]], run=run, confirm=True)
+    assert contents(folder)["toy.csv"] == before
+    with pytest.raises(StaleResultsError, match="1 stale batches"):
+        fill(folder, [CELLS[1], CELLS[2]])
+
+
 def test_stale_rows_of_other_cells_do_not_matter(tmp_path, monkeypatch):
     fill(tmp_path, CELLS[:1])
     monkeypatch.setattr(results, "source_hash", lambda modules: "today")

@@ -1,0 +1,39 @@
+"""Tables of the book's notebooks, in one style."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import pandas as pd
+from pandas.io.formats.style import Styler
+
+from ipo.results import provenance
+
+
+def show(frame: pd.DataFrame, formats: dict[str, str] | str | None = None) -> Styler:
+    """A table without its index; ``formats`` of its numbers, by column."""
+    return frame.style.format(formats).hide().set_table_attributes('class="dataframe"')
+
+
+def mean_and_std(values: pd.Series, digits: int = 1) -> str:
+    """Of runs; the standard deviation is that of the paper (ddof 0)."""
+    return f"{values.mean():.{digits}f} ± {values.std(ddof=0):.{digits}f}"
+
+
+def costs(folder: str | Path, names: Sequence[str]) -> Styler:
+    """What it took to compute experiments, from the record beside the rows of each."""
+
+    def row(name: str) -> dict[str, object]:
+        batches = provenance(folder, name)
+        return {
+            "experiment": name,
+            "batches": len(batches),
+            "runs": sum(len(batch["seeds"]) for batch in batches),
+            "CPU minutes": sum(batch["cpu_seconds"] for batch in batches) / 60,
+            "machine": ", ".join(sorted({batch["machine"] for batch in batches})),
+            "torch": ", ".join(sorted({batch["versions"]["torch"] for batch in batches})),
+            "source": ", ".join(sorted({batch["source_hash"] for batch in batches})),
+        }
+
+    return show(pd.DataFrame(map(row, names)), {"CPU minutes": "{:.1f}"})

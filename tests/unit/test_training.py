@@ -1,0 +1,276 @@
+"""The training loop: rollouts by hand, normalised rewards, splits of copies, and going on."""
+
+import math
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from gymnasium.vector import AutoresetMode
+from torch import Tensor
+
+from ipo.distributions import Gaussian
+from ipo.networks import DenseNetwork
+from ipo.ppo import Settings, Training, train
+from ipo.rollouts import FromGymnasium, RewardNormalizer, Step, advantages, collect
+
+SMALL = {"num_envs": 4, "num_steps": 16, "minibatch_size": 16, "num_updates": 4, "num_epochs": 2}
+
+
+class Counting:
+    """Each copy counts its steps, is paid its action, and runs out of time after ``horizon``."""
+
+    def __init__(self, num_runs: int, num_copies: int, horizon: int = 5) -> None:
+        self.shape, self.horizon = (num_runs, num_copies), horizon
+
+    def reset(self) -> Tensor:
+        self.count = torch.zeros(self.shape)
+        return self.count.unsqueeze(-1)
+
+    def step(self, actions: Tensor) -> Step:
+        last = self.count + 1
+        truncated = last == self.horizon
+        self.count = torch.where(truncated, 0.0, last)
+        never = torch.zeros_like(truncated)
+        reward = actions.squeeze(-1)
+        return Step(self.count.unsqueeze(-1), reward, never, truncated, last.unsqueeze(-1))
+
+    def state(self) -> dict:
+        return {"count": self.count}
+
+    def restore(self, state: dict) -> None:
+        self.count = state["count"]
+
+
+def counting(domains, num_copies, generators):
+    return Counting(len(generators), sum(num_copies))
+
+
+NETWORK = DenseNetwork(1, 1, hidden=(8,))
+
+
+def trainings(settings: Settings, seeds=(0, 1)) -> Training:
+    return Training(NETWORK, NETWORK.start, counting, 2, settings, list(seeds))
+
+
+# --------------------------------------------------------------------------------- rollouts
+
+
+def policy(observation: Tensor) -> tuple[Tensor, Tensor]:
+    """Means 0, deviations 1, and a critic that says 10 everywhere."""
+    zero = torch.zeros_like(observation)
+    return torch.cat([zero, zero + 1], -1), zero.squeeze(-1) + 10
+
+
+def rollout(time_outs: str):
+    environments = Counting(1, 2, horizon=3)
+    found, _ = collect(
+        policy,
+        Gaussian,
+        environments,
+        environments.reset(),
+        num_steps=4,
+        generators=[np.random.default_rng(0)],
+        normalizer=None,
+        discount=0.5,
+        gae_lambda=0.0,  # A_t = delta_t
+        time_outs=time_outs,
+    )
+    return found
+
+
+@pytest.mark.parametrize(
+    ("time_outs", "at_the_time_out"),
+    [
+        ("bootstrap", lambda r: r + 0.5 * 10 - 10),
+        ("terminal", lambda r: r - 10),
+        ("no_advantage", lambda r: torch.zeros_like(r)),
+    ],
+)
+def test_what_a_time_out_is_worth(time_outs, at_the_time_out):
+    found = rollout(time_outs)
+    rewards = found.actions.squeeze(-1)
+    expected = rewards + 0.5 * 10 - 10
+    expected[..., 2] = at_the_time_out(rewards[..., 2])
+    torch.testing.assert_close(found.advantages, expected)
+    torch.testing.assert_close(found.returns, found.values + found.advantages)
+    density = Gaussian.log_probability(policy(found.observations)[0], found.actions)
+    torch.testing.assert_close(found.log_probabilities, density)
+
+
+def test_no_advantage_flows_over_a_step_that_is_left_out():
+    ended = torch.tensor([[False, True, False]])
+    rewards, values = torch.tensor([[1.0, 2.0, 4.0]]), torch.tensor([[10.0, 20.0, 30.0]])
+    next_values = torch.tensor([[20.0, 30.0, 40.0]])
+    found = advantages(rewards, values, next_values, ended, 0.5, 0.5, without=ended)
+    last = 4 + 0.5 * 40 - 30
+    torch.testing.assert_close(found, torch.tensor([[1 + 0.5 * 20 - 10, 0.0, last]]))
+
+
+# ------------------------------------------------------------------------ normalised rewards
+
+
+def slow_normalizer(rewards, ended, discount, clip):
+    """One run, step by step, with all discounted returns kept in a list."""
+    G, seen, scaled = np.zeros(len(rewards)), [], []
+    for reward, over in zip(rewards.T, ended.T, strict=True):
+        G = discount * G + reward
+        seen.extend(G)
+        scaled.append(np.clip(reward / np.sqrt(np.var(seen) + 1e-8), -clip, clip))
+        G = np.where(over, 0.0, G)
+    return np.stack(scaled, -1)
+
+
+def test_rewards_are_normalised_as_step_by_step_and_piece_by_piece():
+    random = np.random.default_rng(0)
+    rewards, ended = random.normal(3, 2, (2, 3, 40)), random.random((2, 3, 40)) < 0.1
+    expected = np.stack(
+        [slow_normalizer(r, e, 0.9, 1.5) for r, e in zip(rewards, ended, strict=True)]
+    )
+    whole = RewardNormalizer(2, 3, 0.9, 1.5)(torch.tensor(rewards), torch.tensor(ended))
+    np.testing.assert_allclose(whole, expected)
+    assert np.abs(expected).max() == 1.5, "nothing was clipped: the test is too weak"
+    pieces = RewardNormalizer(2, 3, 0.9, 1.5)
+    parts = [
+        pieces(torch.tensor(r), torch.tensor(e))
+        for r, e in zip(np.split(rewards, 4, -1), np.split(ended, 4, -1), strict=True)
+    ]
+    np.testing.assert_allclose(torch.cat(parts, -1), expected)
+
+
+# -------------------------------------------------------------------------- copies of domains
+
+
+@pytest.mark.parametrize(
+    ("method", "num_envs", "copies"),
+    [
+        ("ppo", 32, [[16, 16]]),
+        ("ipo", 32, [[16], [16]]),
+        ("ensemble", 32, [[8, 8], [8, 8]]),
+        ("ppo", (24, 8), [[24, 8]]),
+        ("ipo", (24, 8), [[24], [8]]),
+        ("ensemble", (24, 8), [[12, 4], [12, 4]]),
+    ],
+)
+def test_copies_are_shared_among_players(method, num_envs, copies):
+    assert Settings(method, num_envs=num_envs).copies_of_players(2) == copies
+
+
+def test_players_with_unequal_rollouts_make_the_same_number_of_steps():
+    settings = Settings("ipo", **(SMALL | {"num_envs": (3, 1), "num_minibatches": 8}))
+    assert settings.size_of_minibatches(3 * 16) == 6
+    assert settings.size_of_minibatches(1 * 16) == 2
+    training = trainings(settings)
+    training.update()
+    steps = [own.state_dict()["state"][0]["step"].item() for own in training.optimizers]
+    assert steps == [8 * settings.num_epochs] * 2
+    assert training.num_frames == 4 * 16
+
+
+@pytest.mark.parametrize(
+    ("change", "error"),
+    [
+        ({"num_envs": 5}, "num_envs = 5: must be a multiple of 2"),
+        ({"num_envs": (4,)}, r"num_envs = \(4,\): must name a multiple of 1 for each of 2 domains"),
+        ({"num_envs": (4, 0)}, "num_envs = 0: must be at least 1"),
+        ({"minibatch_size": 1000}, "minibatch_size = 1000: must be at most 32"),
+        ({"num_minibatches": 33}, "num_minibatches = 33: must be at most 32"),
+        ({"num_minibatches": 0}, "num_minibatches = 0: must be at least 1"),
+        ({"adam_epsilon": 0.0}, "adam_epsilon = 0.0: must be greater than 0"),
+        ({"reward_clip": -1.0}, "reward_clip = -1.0: must be greater than 0"),
+        ({"discount": 1.5}, "discount = 1.5: must be at most 1"),
+        ({"time_outs": "terminate"}, "time_outs = 'terminate': .* did you mean 'terminal'"),
+        ({"normalize_advantages": True}, "normalize_advantages = True: must be one of none"),
+    ],
+)
+def test_settings_that_make_no_sense_are_refused(change, error):
+    with pytest.raises(ValueError, match=error):
+        trainings(Settings("ipo", **(SMALL | change)))
+
+
+# ------------------------------------------------------------------------------ going on
+
+
+def flat(training: Training) -> Tensor:
+    return torch.cat([w.detach().flatten() for p in training.players for w in p.values()])
+
+
+@pytest.mark.parametrize("method", ["ppo", "ipo", "ensemble"])
+def test_a_restored_training_goes_on_as_if_nothing_had_happened(method):
+    changes = {"normalize_rewards": True, "normalize_advantages": "rollout", "num_steps": 18}
+    settings = Settings(method, **(SMALL | changes))
+    whole = trainings(settings)
+    for _ in range(4):
+        whole.update()
+    first = trainings(settings)
+    for _ in range(2):
+        first.update()
+    second = trainings(settings)
+    second.restore(first.state())
+    for _ in range(2):
+        second.update()
+    assert torch.equal(flat(second), flat(whole))
+    assert second.num_frames == whole.num_frames == 4 * 4 * 18
+    assert not torch.equal(flat(first), flat(whole))
+
+
+def test_training_raises_what_is_rewarded():
+    """The reward is the action: means must grow."""
+    settings = Settings(
+        "ipo",
+        **(SMALL | {"num_updates": 20, "learning_rate": 0.01, "normalize_advantages": "rollout"}),
+    )
+    *_, (_, players) = train(NETWORK, NETWORK.start, counting, 2, settings, [0, 1])
+    mean = NETWORK.frozen(players)(torch.ones(2, 1, 1))[0][..., 0]
+    assert (mean > 0.5).all()
+
+
+def test_runs_do_not_mix():
+    settings = Settings("ipo", **SMALL)
+    together = trainings(settings, (0, 1))
+    alone = trainings(settings, (1,))
+    for training in (together, alone):
+        training.update()
+    for d in range(2):
+        for name, weight in alone.players[d].items():
+            torch.testing.assert_close(together.players[d][name][1:], weight, rtol=0, atol=1e-6)
+
+
+# --------------------------------------------------------------------------- gymnasium's own
+
+
+def vector(mode: AutoresetMode = AutoresetMode.SAME_STEP, num_envs: int = 4):
+    return gym.make_vec(
+        "Pendulum-v1",
+        num_envs=num_envs,
+        vectorization_mode="sync",
+        vector_kwargs={"autoreset_mode": mode},
+    )
+
+
+def test_gymnasiums_environments_get_streams_of_their_own():
+    first, again = (FromGymnasium(vector(), 2, seed=3).reset() for _ in range(2))
+    assert torch.equal(first, again)
+    assert first.shape == (2, 2, 3)
+    other = FromGymnasium(vector(), 2, seed=4).reset()
+    assert len({tuple(row.tolist()) for row in torch.cat([first, other]).flatten(0, 1)}) == 8
+
+
+def test_continuous_actions_reach_gymnasiums_environments():
+    copies = FromGymnasium(vector(), 2, seed=0)
+    copies.reset()
+    step = copies.step(torch.tensor([[[0.0], [2.0]], [[-2.0], [0.0]]]))
+    assert step.reward.shape == (2, 2)
+    assert math.isclose(float(copies.envs.envs[1].unwrapped.last_u), 2.0)
+
+
+@pytest.mark.parametrize(
+    ("envs", "num_runs", "error"),
+    [
+        (vector(AutoresetMode.NEXT_STEP), 1, "must have SAME_STEP"),
+        (vector(), 3, "4 copies, must be a multiple of 3 runs"),
+    ],
+)
+def test_vector_environments_that_do_not_fit_are_refused(envs, num_runs, error):
+    with pytest.raises(ValueError, match=error):
+        FromGymnasium(envs, num_runs, seed=0)
