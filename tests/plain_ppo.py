@@ -39,15 +39,18 @@ def averaged(players, images):
     return sum(logits) / len(players), sum(values) / len(players)
 
 
-def train(players, envs, s, draws, orders, seed):
+def train(players, envs, s, draws, orders, seeds):
     """Yields the players after every update; ``envs[d]`` is the list that player d acts in.
 
-    Copy n of a player's environments is first reset with ``seed + n``; ``draws`` and ``orders``
-    are the generators of actions and of the minibatches.
+    ``seeds[d]`` are those of the first resets; ``draws`` and ``orders`` are the generators of
+    actions and of the minibatches.
     """
     like = next(players[0].parameters())
     optimizers = [torch.optim.Adam(player.parameters(), s.learning_rate) for player in players]
-    seen = [[env.reset(seed=seed + n)[0] for n, env in enumerate(own)] for own in envs]
+    seen = [
+        [env.reset(seed=seed)[0] for env, seed in zip(*own, strict=True)]
+        for own in zip(envs, seeds, strict=True)
+    ]
     for _ in range(s.num_updates):
         for d in range(len(players)):
             rollout = collect(players, envs[d], seen[d], s, draws, like)
@@ -75,7 +78,7 @@ def collect(players, envs, seen, s, draws, like):
             seen[n], reward, terminated, truncated, _ = env.step(int(actions[n]))
             rewards[n], ends[n] = np.float32(reward), terminated or truncated
             if ends[n]:
-                if not terminated and not s.truncation_is_terminal:
+                if not terminated and s.time_outs == "bootstrap":
                     future[n] = act_on([seen[n]])[1][0]
                 seen[n], _ = env.reset()
         chosen = log_probabilities[range(len(envs)), actions]
@@ -126,7 +129,7 @@ def loss(players, frames, s):
     policy = torch.distributions.Categorical(logits=logits)
     old_values, gains = frames["values"], frames["gains"]
     returns = old_values + gains
-    if s.normalize_advantages:
+    if s.normalize_advantages == "minibatch":
         gains = (gains - gains.mean()) / (gains.std() + 1e-8)
     ratio = torch.exp(policy.log_prob(frames["actions"]) - frames["log_probabilities"])
     clipped_ratio = torch.clamp(ratio, 1 - s.clip, 1 + s.clip)

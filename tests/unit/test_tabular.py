@@ -23,8 +23,10 @@ from ipo.tabular import (
     TabularTask,
     expected_return,
     load_or_tabulate,
+    occupancy,
     optimal_policy,
     reach,
+    state_of,
     tabulate,
 )
 
@@ -50,8 +52,8 @@ def describe(env: ColoredKeysEnv) -> tuple:
 class Seen:
     """A state of MiniGrid, and what each action does there at two moments of an episode."""
 
+    env: ColoredKeysEnv
     image: np.ndarray
-    progress: int
     next_states: list[tuple]
     early: list[tuple[float, bool, bool]]
     last: list[tuple[float, bool, bool]]
@@ -89,8 +91,8 @@ def explored() -> Explored:
             continue
         after, early = zip(*(stepped(env, a, EARLY) for a in range(NUM_ACTIONS)), strict=True)
         states[describe(env)] = Seen(
+            env,
             env.gen_obs()["image"],
-            env.progress,
             [describe(new) for new in after],
             list(early),
             [stepped(env, a, LAST)[1] for a in range(NUM_ACTIONS)],
@@ -165,7 +167,9 @@ def test_every_step_from_every_state_is_minigrids(explored, index_of, keys):
     for state, seen in explored.states.items():
         s = index_of[state]
         assert np.array_equal(task.images[task.observation[s]], seen.image)
-        assert task.progress[s] == seen.progress
+        assert task.progress[s] == seen.env.progress
+        assert tuple(task.position[s]) == tuple(seen.env.agent_pos)
+        assert state_of(task, seen.env) == s
         for a in range(NUM_ACTIONS):
             goal, done = bool(task.goal[s, a]), bool(task.done[s, a])
             num_goals += goal
@@ -186,7 +190,7 @@ def test_reward_of_the_goal_in_every_step(keys):
 def test_colors_differ_in_the_images_of_key_and_door_alone(keys, color):
     task, grey = keys[color], keys["grey"]
     for name in ARRAYS:
-        if name not in ("images", "observation"):
+        if name not in ("images", "observation", "signature"):
             assert np.array_equal(getattr(task, name), getattr(grey, name)), name
     seen, expected = task.images[task.observation], grey.images[grey.observation]
     colored = np.isin(expected[..., 0], [OBJECT_TO_IDX["key"], OBJECT_TO_IDX["door"]])
@@ -205,6 +209,13 @@ def test_layouts_are_drawn_as_often_as_the_table_says(index_of, keys):
     assert counts[~starts].sum() == 0
     expected = 4800 * keys["grey"].start[starts]
     assert scipy.stats.chisquare(counts[starts], expected).pvalue > 1e-4
+
+
+def test_state_of_another_task_is_refused(keys):
+    env = ColoredKeysEnv(color="red")
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=r"^env = <.*: is in no state of this table$"):
+        state_of(keys["green"], env)
 
 
 @pytest.mark.parametrize("colors", [("grey",), ("red", "green"), ("yellow", "blue", "purple")])
@@ -448,6 +459,8 @@ def random_task(seed: int, num_states: int, num_actions: int, horizon: int) -> T
         observation=rng.integers(0, 2, size=num_states),
         images=np.zeros((2, 1, 1, 1)),
         progress=np.zeros(num_states, dtype=int),
+        position=np.zeros((num_states, 2), dtype=int),
+        signature=np.arange(num_states, dtype=np.uint64),
     )
 
 
@@ -514,6 +527,30 @@ def test_reach_is_the_sum_over_all_episodes(task, seed):
     states = np.random.default_rng(seed).random(len(task.start)) < 0.4
     slow = [slow_reach(task, each, states) for each in policy]
     assert reach(task, policy, states) == pytest.approx(slow, rel=1e-12)
+
+
+def slow_occupancy(task: TabularTask, policy: np.ndarray) -> np.ndarray:
+    """Expected number of steps in each state: the sum over all episodes."""
+    steps = np.zeros(len(task.start))
+
+    def ahead(state: int, t: int, probability: float) -> None:
+        if t == task.horizon:
+            return
+        steps[state] += probability
+        for action, share in enumerate(policy[task.observation[state]]):
+            if not task.done[state, action]:
+                ahead(task.next_state[state, action], t + 1, probability * share)
+
+    for state, probability in enumerate(task.start):
+        ahead(state, 0, probability)
+    return steps
+
+
+@given(tasks, st.integers(0, 100))
+def test_occupancy_is_the_sum_over_all_episodes(task, seed):
+    policy = random_policy(task, seed)
+    slow = np.stack([slow_occupancy(task, each) for each in policy])
+    assert occupancy(task, policy) == pytest.approx(slow, rel=1e-12)
 
 
 @given(tasks)
