@@ -33,4 +33,6 @@ def tables(tmp_path_factory, worker_id) -> Path:
 @pytest.fixture(scope="session")
 def keys(tables) -> dict[str, TabularTask]:
     """The coloured keys as tables, by colour."""
-    return {color: load_or_tabulate(ColoredKeysEnv, tables, color=color) for color in COLORS}
+    return {
+        color: load_or_tabulate(ColoredKeysEnv, tables, size=5, color=color) for color in COLORS
+    }
