@@ -1,6 +1,6 @@
 """PPO and IPO, slow and obvious: the yardstick for ``ipo.ppo`` and ``ipo.networks``.
 
-One run at a time, a loop over environments, one network call per step, layers of ``torch.nn``.
+One run at a time, a loop over environments, layers of ``torch.nn``.
 Shares no code with ``ipo``; meant to be checked by reading. PPO is one player; IPO is a player for
 each domain. ``s`` is anything with the attributes of ``ipo.ppo.Settings``.
 """
@@ -39,11 +39,12 @@ def averaged(players, images):
     return sum(logits) / len(players), sum(values) / len(players)
 
 
-def train(players, envs, s, draws, orders, seeds):
+def train(players, envs, s, draws, orders, seeds, at_once=True):
     """Yields the players after every update; ``envs[d]`` is the list that player d acts in.
 
     ``seeds[d]`` are those of the first resets; ``draws`` and ``orders`` are the generators of
-    actions and of the minibatches.
+    actions and of the minibatches. The network is called for what all environments show
+    ``at_once``, or for each of them alone.
     """
     like = next(players[0].parameters())
     optimizers = [torch.optim.Adam(player.parameters(), s.learning_rate) for player in players]
@@ -53,17 +54,19 @@ def train(players, envs, s, draws, orders, seeds):
     ]
     for _ in range(s.num_updates):
         for d in range(len(players)):
-            rollout = collect(players, envs[d], seen[d], s, draws, like)
+            rollout = collect(players, envs[d], seen[d], s, draws, like, at_once)
             improve(players, d, optimizers[d], rollout, s, orders)
         yield players
 
 
-def collect(players, envs, seen, s, draws, like):
+def collect(players, envs, seen, s, draws, like, at_once):
     """``s.num_steps`` steps in every environment; ``seen`` is updated in place."""
 
     @torch.no_grad()
     def act_on(images):
-        logits, values = averaged(players, torch.tensor(np.stack(images)).to(like))
+        images = torch.tensor(np.stack(images)).to(like)
+        answers = [averaged(players, part) for part in ([images] if at_once else images.split(1))]
+        logits, values = (torch.cat(part) for part in zip(*answers, strict=True))
         return logits.log_softmax(1), values
 
     frames = []  # one list of columns for every step
