@@ -151,12 +151,13 @@ def fingerprint(notebook: Notebook) -> str:
     folders = (
         notebook.root / "data" / "paper",
         notebook.root / "data" / "results" / notebook.name,
+        notebook.root / "data" / "policies" / notebook.name,
     )
     everything = {
         "code": code,
         "parameters": notebook.parameters,
         "modules": provenance.source_hash(provenance.imported_modules(python)),
-        "data": {folder.name: tree_hash(folder) for folder in folders},
+        "data": {str(folder.relative_to(notebook.root)): tree_hash(folder) for folder in folders},
         "packages": (notebook.root / "environment.txt").read_text(encoding="utf-8"),
     }
     return hashlib.sha256(json.dumps(everything, sort_keys=True).encode()).hexdigest()

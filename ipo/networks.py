@@ -10,7 +10,6 @@ appendix of the paper):
 
 from __future__ import annotations
 
-import itertools
 import json
 import math
 from collections.abc import Callable, Sequence
@@ -23,8 +22,7 @@ import safetensors.torch
 import torch
 from torch import Tensor
 
-from ipo.checks import check_count
-from ipo.distributions import Categorical, Distribution, Gaussian
+from ipo.distributions import Categorical, Distribution
 from ipo.game import average
 
 PIECE = 256  # rows of a table that are evaluated together
@@ -121,7 +119,7 @@ class GridNetwork(Network):
         """``images [R, B, 7, 7, C]`` -> logits ``[R, B, A]``, values ``[R, B]``."""
 
         def layer(name: str, x: Tensor) -> Tensor:
-            return _dense(weights, name, x.flatten(1, -2)).reshape(*x.shape[:-1], -1)
+            return dense(weights, name, x.flatten(1, -2)).reshape(*x.shape[:-1], -1)
 
         x = _max_pool(layer("conv1", _patches(images))).relu()  # [R, B, 3, 3, 16]
         x = layer("conv2", _patches(x)).relu()  # [R, B, 2, 2, 32]
@@ -129,84 +127,6 @@ class GridNetwork(Network):
         logits = layer("actor2", layer("actor1", x).tanh())
         values = layer("critic2", layer("critic1", x).tanh())
         return logits, values.squeeze(-1)
-
-
-class DenseNetwork(Network):
-    """A separate actor and critic of tanh layers, for observations that are vectors.
-
-    With the default sizes it is the network of the paper's door-opening runs. Weights start as
-    orthogonal matrices times sqrt(2), those of the actor's last layer times 1; biases start at 0.
-    The standard deviations of a Gaussian do not depend on the observation: their logarithms are
-    weights, which start at 0.
-
-    Args:
-        num_observations: length of an observation.
-        num_actions: A, of how many to choose or of how many numbers an action consists.
-        distribution: :class:`Categorical` or :class:`Gaussian`.
-        hidden: units of each hidden layer.
-    """
-
-    def __init__(
-        self,
-        num_observations: int,
-        num_actions: int,
-        distribution: type[Distribution] = Gaussian,
-        hidden: Sequence[int] = (64, 64),
-    ) -> None:
-        check_count("num_observations", num_observations)
-        check_count("num_actions", num_actions)
-        for units in hidden:
-            check_count("hidden", units)
-        self.distribution, self.num_actions = distribution, num_actions
-        self.layers: dict[str, list[str]] = {}
-        self.shapes = {}
-        for part, num_outputs in (("actor", num_actions), ("critic", 1)):
-            sizes = [num_observations, *hidden, num_outputs]
-            self.layers[part] = [f"{part}{i + 1}" for i in range(len(sizes) - 1)]
-            self.shapes |= zip(self.layers[part], itertools.pairwise(sizes), strict=True)
-
-    @property
-    def weight_shapes(self) -> dict[str, tuple[int, ...]]:
-        extra = {"log_std": (self.num_actions,)} if self.distribution is Gaussian else {}
-        return super().weight_shapes | extra
-
-    def _draw(self, generator: np.random.Generator) -> dict[str, np.ndarray]:
-        weights = {name: np.zeros(shape) for name, shape in self.weight_shapes.items()}
-        for layer, shape in self.shapes.items():
-            gain = 1.0 if layer == self.layers["actor"][-1] else math.sqrt(2)
-            weights[f"{layer}.weight"] = gain * _orthogonal(shape, generator)
-        return weights
-
-    def __call__(self, weights: Weights, observations: Tensor) -> Outputs:
-        """``observations [R, B, O]`` -> parameters ``[R, B, P]``, values ``[R, B]``."""
-
-        def outputs(part: str) -> Tensor:
-            x = observations
-            *hidden, last = self.layers[part]
-            for layer in hidden:
-                x = Tanh.apply(_dense(weights, layer, x))
-            return _dense(weights, last, x)
-
-        parameters, values = outputs("actor"), outputs("critic").squeeze(-1)
-        if self.distribution is Gaussian:
-            deviation = weights["log_std"].exp().unsqueeze(1)
-            parameters = torch.cat([parameters, deviation.expand_as(parameters)], -1)
-        return parameters, values
-
-
-class Tanh(torch.autograd.Function):
-    """The hyperbolic tangent by NumPy, which is ten times as fast as torch's on the CPU."""
-
-    @staticmethod
-    def forward(ctx: Any, x: Tensor) -> Tensor:
-        y = torch.from_numpy(np.tanh(x.detach().numpy()))
-        ctx.save_for_backward(y)
-        return y
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> Tensor:
-        (y,) = ctx.saved_tensors
-        return gradient * (1 - y.square())
 
 
 class OnTable:
@@ -286,17 +206,9 @@ def load_policy(
     return players, found
 
 
-def _dense(weights: Weights, name: str, x: Tensor) -> Tensor:
+def dense(weights: Weights, name: str, x: Tensor) -> Tensor:
     """A layer by name: ``x [R, B, inputs] -> [R, B, units]``."""
     return torch.baddbmm(weights[f"{name}.bias"].unsqueeze(1), x, weights[f"{name}.weight"])
-
-
-def _orthogonal(shape: tuple[int, int], generator: np.random.Generator) -> np.ndarray:
-    """A random matrix whose columns, or rows if those are fewer, are orthonormal; uniform."""
-    tall = generator.standard_normal((max(shape), min(shape)))
-    Q, R = np.linalg.qr(tall)
-    Q *= np.sign(np.diag(R))
-    return Q if shape[0] >= shape[1] else Q.T
 
 
 def _patches(x: Tensor) -> Tensor:

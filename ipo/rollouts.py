@@ -10,7 +10,6 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 import torch
-from gymnasium.vector import AutoresetMode, VectorEnv
 from torch import Tensor
 
 from ipo.distributions import Distribution
@@ -42,47 +41,6 @@ class Environments(Protocol):
     def reset(self) -> Tensor: ...
 
     def step(self, actions: Tensor) -> Step: ...
-
-
-class FromGymnasium:
-    """``R x N`` copies in one ``gymnasium.vector.VectorEnv``, which begin anew in the same step.
-
-    Args:
-        envs: made with ``autoreset_mode=AutoresetMode.SAME_STEP``; observations are arrays.
-        num_runs: R; copies r N to (r + 1) N belong to run r.
-        seed: of the first reset; each copy has a random stream of its own.
-    """
-
-    def __init__(self, envs: VectorEnv, num_runs: int, seed: int) -> None:
-        mode = envs.metadata["autoreset_mode"]
-        if mode != AutoresetMode.SAME_STEP:
-            raise ValueError(f"envs: have autoreset_mode = {mode}, must have SAME_STEP")
-        if envs.num_envs % num_runs:
-            raise ValueError(f"envs: {envs.num_envs} copies, must be a multiple of {num_runs} runs")
-        self.envs, self.num_runs = envs, num_runs
-        # Gymnasium's own seeds s, s + 1, ... would give neighbouring runs the same streams.
-        streams = np.random.SeedSequence(seed).spawn(envs.num_envs)
-        self.seeds = [int(stream.generate_state(1)[0]) for stream in streams]
-
-    def reset(self) -> Tensor:
-        return self._by_run(self.envs.reset(seed=self.seeds)[0])
-
-    def step(self, actions: Tensor) -> Step:
-        answer = self.envs.step(actions.flatten(0, 1).numpy())
-        observation, reward, terminated, truncated, info = answer
-        last = observation.copy()
-        for copy in np.flatnonzero(terminated | truncated):
-            last[copy] = info["final_obs"][copy]
-        return Step(
-            self._by_run(observation),
-            self._by_run(reward),
-            self._by_run(terminated).bool(),
-            self._by_run(truncated).bool(),
-            self._by_run(last),
-        )
-
-    def _by_run(self, values: np.ndarray) -> Tensor:
-        return torch.tensor(values, dtype=torch.float32).unflatten(0, (self.num_runs, -1))
 
 
 class RewardNormalizer:

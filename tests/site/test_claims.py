@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+import scipy.stats
 
 import claims
 from rules import RULES
@@ -202,3 +203,72 @@ def test_every_claim_names_a_rule_and_its_settings(claim):
     assert parameters[2:] == list(claim["settings"])
     texts = {"id", "chapter", "title", "claim", "where", "test"}
     assert claim.keys() == texts | {"results", "rule", "settings"}
+
+
+# ------------------------------------------------------------------------------ coloured keys
+
+KEYS = ["method", "train_colors", "color_encoding", "size", "run", "domain", "metric", "value"]
+AS_IN_THE_PAPER = {("ppo", "grey"): (0.80, 0.12), ("ipo", "grey"): (0.85, 0.03)}
+
+
+def write_keys(data: Path, cells: dict[tuple[str, str], tuple[float, float]]) -> None:
+    """A hundred runs of every cell, with this mean and spread, for both metrics."""
+    lines = []
+    for (method, domain), (mean, spread) in cells.items():
+        for metric in ("return_exact", "return_published_protocol"):
+            for run in range(100):
+                value = mean + spread * scipy.stats.norm.ppf((run + 0.5) / 100)
+                lines.append((method, "red+green", "integer", 5, run, domain, metric, value))
+    path = data / "results" / "keys" / "main.csv"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pd.DataFrame(lines, columns=KEYS).to_csv(path, index=False)
+
+
+def training_colors(mean: float) -> dict:
+    return {(m, color): (mean, 0.004) for m in ("ppo", "ipo") for color in ("red", "green")}
+
+
+@pytest.mark.parametrize(
+    ("cells", "expected"),
+    [
+        (training_colors(0.94) | AS_IN_THE_PAPER, claims.REPRODUCED),
+        (training_colors(0.90) | AS_IN_THE_PAPER, claims.IN_PART),
+        (
+            training_colors(0.90) | {("ppo", "grey"): (0.3, 0.1), ("ipo", "grey"): (0.3, 0.1)},
+            claims.NOT_SUPPORTED,
+        ),
+        (AS_IN_THE_PAPER, claims.NO_DATA),
+    ],
+)
+def test_returns_come_back_or_not(empty, cells, expected):
+    write_keys(empty, cells)
+    assert verdict(empty, "keys-numbers") == expected
+
+
+@pytest.mark.parametrize(
+    ("ipo", "ensemble", "better", "game"),
+    [
+        (0.85, 0.80, claims.REPRODUCED, claims.REPRODUCED),
+        (0.85, 0.85, claims.REPRODUCED, claims.NOT_SUPPORTED),
+        (0.81, 0.85, claims.NOT_SUPPORTED, claims.NOT_SUPPORTED),
+    ],
+)
+def test_higher_return_or_not(empty, ipo, ensemble, better, game):
+    write_keys(
+        empty,
+        {
+            ("ppo", "grey"): (0.80, 0.10),
+            ("ipo", "grey"): (ipo, 0.10),
+            ("ensemble", "grey"): (ensemble, 0.10),
+        },
+    )
+    assert verdict(empty, "keys-better") == better
+    assert verdict(empty, "keys-because-of-the-game") == game
+
+
+@pytest.mark.parametrize(
+    ("spread", "expected"), [(0.03, claims.REPRODUCED), (0.12, claims.NOT_SUPPORTED)]
+)
+def test_smaller_spread_or_not(empty, spread, expected):
+    write_keys(empty, {("ppo", "grey"): (0.8, 0.12), ("ipo", "grey"): (0.8, spread)})
+    assert verdict(empty, "keys-consistent") == expected

@@ -9,10 +9,11 @@ import torch
 from gymnasium.vector import AutoresetMode
 from torch import Tensor
 
+from ipo.dense_network import DenseNetwork
 from ipo.distributions import Gaussian
-from ipo.networks import DenseNetwork
 from ipo.ppo import Settings, Training, train
-from ipo.rollouts import FromGymnasium, RewardNormalizer, Step, advantages, collect
+from ipo.rollouts import RewardNormalizer, Step, advantages, collect
+from ipo.vector_environments import FromGymnasium
 
 SMALL = {"num_envs": 4, "num_steps": 16, "minibatch_size": 16, "num_updates": 4, "num_epochs": 2}
 
