@@ -21,8 +21,8 @@ from ipo.colored_keys import ColoredKeysEnv
 from ipo.keys_experiments import Cell, encode, run_cell
 from ipo.networks import GridNetwork, Weights, load_policy, save_policy
 from ipo.ppo import Settings, published, train
-from ipo.rollouts import FromGymnasium
 from ipo.tabular import NotTabularError, load_or_tabulate
+from ipo.vector_environments import FromGymnasium
 
 UNCHECKED = pytest.mark.xfail(strict=True, reason="not checked yet")
 ALL_COLORS = "must be one of red, green, blue, purple, yellow, grey"

@@ -32,8 +32,9 @@ from ipo.ppo import (
     published,
     train,
 )
-from ipo.rollouts import FromGymnasium, Rollout, Step, advantages, collect
+from ipo.rollouts import Rollout, Step, advantages, collect
 from ipo.tabular import TabularDomains, expected_return, optimal_policy, tabulate
+from ipo.vector_environments import FromGymnasium
 
 SMALL = {
     "num_updates": 3,
