@@ -1,12 +1,14 @@
-"""Small problems and comparisons, in double precision, for the tests of several modules."""
+"""Small problems, networks and comparisons, in double precision, for several tests."""
 
 from collections.abc import Sequence
 
 import numpy as np
 import torch
+from plain_ppo import ActorCritic
 from torch import Tensor
 
 from ipo.lqr import LQR, sample_problem
+from ipo.networks import GridNetwork, Outputs, Weights
 
 
 def paper_problem(
@@ -65,3 +67,36 @@ def assert_close(actual: Tensor, expected: object, rtol: float = 1e-9) -> None:
     expected = torch.as_tensor(np.asarray(expected), dtype=actual.dtype)
     atol = rtol * float(expected.abs().max())
     torch.testing.assert_close(actual, expected, rtol=0, atol=atol)
+
+
+class DoubleNetwork(GridNetwork):
+    """The grid network in double precision, so that float order cannot pass for a mistake."""
+
+    def start(self, generators: Sequence[np.random.Generator]) -> Weights:
+        return {name: weight.double() for name, weight in super().start(generators).items()}
+
+    def __call__(self, weights: Weights, images: Tensor) -> Outputs:
+        return super().__call__(weights, images.double())
+
+
+def plain_network(weights: Weights, run: int = 0) -> ActorCritic:
+    """One run's weights in layers of ``torch.nn``."""
+    first, last = weights["conv1.weight"], weights["actor2.weight"]
+    network = ActorCritic(first.shape[1] // 4, last.shape[2]).to(first.dtype)
+    layers = {
+        "conv1": network.convolutions[0],
+        "conv2": network.convolutions[3],
+        "conv3": network.convolutions[5],
+        "actor1": network.actor[0],
+        "actor2": network.actor[2],
+        "critic1": network.critic[0],
+        "critic2": network.critic[2],
+    }
+    with torch.no_grad():
+        for name, layer in layers.items():
+            matrix = weights[f"{name}.weight"][run].T  # [units, inputs]
+            if name.startswith("conv"):  # inputs are row by row the pixels of a 2x2 square
+                matrix = matrix.unflatten(1, (2, 2, -1)).permute(0, 3, 1, 2)
+            layer.weight.copy_(matrix)
+            layer.bias.copy_(weights[f"{name}.bias"][run])
+    return network

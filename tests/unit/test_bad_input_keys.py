@@ -1,0 +1,383 @@
+"""Bad input to the coloured keys and to training: an error before any work, and nothing written.
+
+Every message names the parameter or the file, its value and the rule. What a table cannot describe
+is in ``test_tabular.py``, settings with which a training of two players cannot begin also in
+``test_training.py``.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+import safetensors.torch
+import torch
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from test_bad_input import INF, LEAST_1, NAN, WHOLE, named
+
+import ipo  # noqa: F401  (registers the environment)
+from ipo.colored_keys import ColoredKeysEnv
+from ipo.keys_experiments import Cell, encode, run_cell
+from ipo.networks import GridNetwork, Weights, load_policy, save_policy
+from ipo.ppo import Settings, published, train
+from ipo.tabular import NotTabularError, load_or_tabulate
+from ipo.vector_environments import FromGymnasium
+
+UNCHECKED = pytest.mark.xfail(strict=True, reason="not checked yet")
+ALL_COLORS = "must be one of red, green, blue, purple, yellow, grey"
+
+# -------------------------------------------------------------------------- environment
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "error", "rule"),
+    [
+        ("color", "gray", ValueError, f"{ALL_COLORS}; did you mean 'grey'\\?"),
+        ("color", "orange", ValueError, ALL_COLORS),
+        ("color", "Red", ValueError, f"{ALL_COLORS}; did you mean 'red'\\?"),
+        ("color", 5, ValueError, f"{ALL_COLORS}$"),
+        ("color", None, ValueError, f"{ALL_COLORS}$"),
+        ("size", 4, ValueError, "must be at least 5$"),
+        ("size", 0, ValueError, "must be at least 5$"),
+        ("size", -5, ValueError, "must be at least 5$"),
+        ("size", 5.0, TypeError, f"{WHOLE} float"),
+        ("size", "5", TypeError, f"{WHOLE} str"),
+        ("size", True, TypeError, f"{WHOLE} bool"),
+        ("max_steps", 0, ValueError, LEAST_1),
+        ("max_steps", -1, ValueError, LEAST_1),
+        ("max_steps", 2.5, TypeError, f"{WHOLE} float"),
+    ],
+)
+def test_environment_that_cannot_be(name, value, error, rule):
+    for make in (ColoredKeysEnv, lambda **options: gymnasium.make("ipo/ColoredKeys-v0", **options)):
+        with pytest.raises(error, match=named(name, value, rule)):
+            make(**{name: value})
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"size": 4}, r"^size = 4: must be at least 5"),
+        ({"color": "pink"}, rf"^color = 'pink': {ALL_COLORS}"),
+    ],
+)
+def test_no_table_of_an_environment_that_cannot_be(tmp_path, options, message):
+    with pytest.raises(ValueError, match=message):
+        load_or_tabulate(ColoredKeysEnv, tmp_path, **options)
+    assert list(tmp_path.glob("*.npz")) == []
+
+
+def test_no_table_of_a_random_environment(tmp_path, monkeypatch):
+    """Nothing is left in the folder of tables that a later call could load."""
+    original = ColoredKeysEnv.step
+
+    def drifting(env: ColoredKeysEnv, action: int) -> tuple:
+        env.agent_dir = int(env.np_random.integers(0, 4))
+        return original(env, action)
+
+    monkeypatch.setattr(ColoredKeysEnv, "step", drifting)
+    with pytest.raises(NotTabularError, match=r"^env = .*: must be deterministic, but action 0"):
+        load_or_tabulate(ColoredKeysEnv, tmp_path, color="red")
+    assert list(tmp_path.glob("*.npz")) == []
+
+
+# ----------------------------------------------------------------------------- settings
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "error", "rule"),
+    [
+        ("method", "poo", ValueError, "must be one of ppo, ipo, ensemble; did you mean 'ppo'"),
+        ("method", None, ValueError, "must be one of ppo, ipo, ensemble"),
+        ("learning_rate", 0, ValueError, "must be greater than 0"),
+        ("learning_rate", -1e-3, ValueError, "must be greater than 0"),
+        ("learning_rate", NAN, ValueError, "must not be NaN"),
+        ("learning_rate", "1e-3", TypeError, "must be a number, not str"),
+        pytest.param("learning_rate", INF, ValueError, "must be", marks=UNCHECKED),
+        ("num_updates", 0, ValueError, LEAST_1),
+        ("num_updates", 20.0, TypeError, f"{WHOLE} float"),
+        ("num_envs", 0, ValueError, LEAST_1),
+        ("num_envs", -48, ValueError, LEAST_1),
+        ("num_envs", 4.5, TypeError, f"{WHOLE} float"),
+        ("num_steps", 0, ValueError, LEAST_1),
+        ("num_steps", None, TypeError, f"{WHOLE} NoneType"),
+        ("num_epochs", 0, ValueError, LEAST_1),
+        ("minibatch_size", 0, ValueError, LEAST_1),
+        ("minibatch_size", True, TypeError, f"{WHOLE} bool"),
+        ("clip", 0.0, ValueError, "must be greater than 0"),
+        ("clip", NAN, ValueError, "must not be NaN"),
+        ("max_gradient_norm", 0, ValueError, "must be greater than 0"),
+        ("value_weight", -0.5, ValueError, "must be at least 0"),
+        ("entropy_weight", -0.01, ValueError, "must be at least 0"),
+        ("entropy_weight", [0.01], TypeError, "must be a number, not list"),
+        ("discount", 1.01, ValueError, "must be at most 1"),
+        ("discount", -0.1, ValueError, "must be at least 0"),
+        ("gae_lambda", 2, ValueError, "must be at most 1"),
+        ("gae_lambda", NAN, ValueError, "must not be NaN"),
+        ("time_outs", True, ValueError, "must be one of bootstrap, terminal, no_advantage"),
+    ],
+)
+def test_settings_that_make_no_sense(name, value, error, rule):
+    for make in (Settings, published):
+        with pytest.raises(error, match=named(name, value, rule)):
+            make(**({"method": "ipo"} | {name: value}))
+
+
+def test_misspelt_setting():
+    with pytest.raises(TypeError, match="num_env"):
+        published("ppo", num_env=48)
+
+
+# ----------------------------------------------------------------------------- training
+
+
+def nothing_must_happen(*arguments: object) -> None:
+    raise AssertionError("nothing must be drawn, made or trained")
+
+
+@pytest.mark.parametrize(
+    ("method", "num_domains", "changes", "message"),
+    [
+        ("ppo", 2, {"num_envs": 47}, r"^num_envs = 47: must be a multiple of 2, to be split"),
+        ("ipo", 3, {"num_envs": 46}, r"^num_envs = 46: must be a multiple of 3, to be split"),
+        ("ipo", 5, {}, r"^num_envs = 48: must be a multiple of 5, to be split evenly"),
+        ("ensemble", 2, {"num_envs": 6}, r"^num_envs = 6: must be a multiple of 4, to be split"),
+        ("ensemble", 3, {"num_envs": 48}, r"^num_envs = 48: must be a multiple of 9, to be"),
+        (
+            "ppo",
+            2,
+            {"minibatch_size": 6145},
+            r"^minibatch_size = 6145: must be at most 6144, the frames of a player's rollout",
+        ),
+        (
+            "ipo",
+            2,
+            {"minibatch_size": 4096},
+            r"^minibatch_size = 4096: must be at most 3072, the frames of a player's rollout",
+        ),
+        (
+            "ppo",
+            2,
+            {"num_envs": 2, "num_steps": 100},
+            r"^minibatch_size = 256: must be at most 200",
+        ),
+    ],
+)
+def test_training_that_cannot_begin(method, num_domains, changes, message):
+    settings = published(method, **changes)
+    reports = train(
+        GridNetwork(), nothing_must_happen, nothing_must_happen, num_domains, settings, [0]
+    )
+    with pytest.raises(ValueError, match=message):
+        next(reports)
+
+
+@pytest.mark.parametrize("method", ["ppo", "ipo"])
+@UNCHECKED
+def test_training_without_a_domain(method):
+    reports = train(
+        GridNetwork(), nothing_must_happen, nothing_must_happen, 0, published(method), [0]
+    )
+    with pytest.raises(ValueError, match=r"^num_domains = 0: must be at least 1"):
+        next(reports)
+
+
+@pytest.mark.parametrize(
+    ("seeds", "message"),
+    [
+        ([], r"^seeds = \[\]: must not be empty"),
+        ([1, 1], r"^seeds = \[1, 1\]: must not name a value twice"),
+        ([0, -1], r"^seeds\[1\] = -1: must be at least 0"),
+        ([0.5], r"^seeds\[0\] = 0\.5: must be a whole number, not float"),
+        (7, r"^seeds = 7: must be a list of whole numbers"),
+    ],
+)
+def test_seeds_that_are_none(seeds, message):
+    reports = train(
+        GridNetwork(), nothing_must_happen, nothing_must_happen, 2, published("ppo"), seeds
+    )
+    with pytest.raises((TypeError, ValueError), match=message):
+        next(reports)
+
+
+@pytest.mark.parametrize(
+    ("mode", "num_envs", "num_runs", "message"),
+    [
+        (AutoresetMode.NEXT_STEP, 4, 2, r"^envs: have autoreset_mode = .*, must have SAME_STEP"),
+        (AutoresetMode.DISABLED, 4, 2, r"^envs: have autoreset_mode = .*, must have SAME_STEP"),
+        (AutoresetMode.SAME_STEP, 5, 2, r"^envs: 5 copies, must be a multiple of 2 runs"),
+    ],
+)
+def test_vector_environment_that_does_not_fit(mode, num_envs, num_runs, message):
+    envs = SyncVectorEnv([ColoredKeysEnv] * num_envs, autoreset_mode=mode)
+    with pytest.raises(ValueError, match=message):
+        FromGymnasium(envs, num_runs, seed=0)
+
+
+# --------------------------------------------------------------------------- experiment
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"train_colors": ("red", "gren")}, rf"^train_colors = 'gren': {ALL_COLORS}; .*'green'"),
+        ({"train_colors": ("pink",)}, rf"^train_colors = 'pink': {ALL_COLORS}"),
+        ({"color_encoding": "onehot"}, r"^color_encoding = 'onehot': must be one of integer, one_"),
+        ({"color_encoding": None}, r"^color_encoding = None: must be one of integer, one_hot, no"),
+        pytest.param({"train_colors": ()}, r"^train_colors = \(\): must", marks=UNCHECKED),
+        pytest.param(
+            {"train_colors": ("red", "red")}, r"^train_colors = .* twice", marks=UNCHECKED
+        ),
+    ],
+)
+def test_cell_that_makes_no_sense(changes, message):
+    with pytest.raises(ValueError, match=message):
+        Cell("ppo", published("ppo"), **changes)
+
+
+@pytest.mark.parametrize(
+    ("cell", "seeds", "message"),
+    [
+        (Cell("ppo", published("ppo"), size=4), [0], r"^size = 4: must be at least 5"),
+        (Cell("ppo", published("ppo", num_envs=5)), [0], r"^num_envs = 5: must be a multiple of 2"),
+        (Cell("ipo", published("ipo", minibatch_size=5000)), [0], r"^minibatch_size = 5000: must"),
+        (Cell("ppo", published("ppo")), [0, 0], r"^seeds = \[0, 0\]: must not name a value twice"),
+        (Cell("ppo", published("ppo")), [], r"^seeds = \[\]: must not be empty"),
+    ],
+)
+def test_cell_that_cannot_be_run_saves_no_policy(tmp_path, tables, keys, cell, seeds, message):
+    with pytest.raises(ValueError, match=message):
+        run_cell(cell, seeds, tables, tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+@UNCHECKED
+def test_encoding_that_does_not_exist(keys):
+    with pytest.raises(ValueError, match=r"^color_encoding = 'onehot': must be one of integer"):
+        encode(keys["red"].images, "onehot")
+
+
+# ---------------------------------------------------------------------- files of policies
+
+NETWORK = GridNetwork()
+
+
+def saved(path: Path, change: Callable[[dict[str, torch.Tensor]], object] = len) -> Path:
+    """The policy of one player and two runs in a file, changed by ``change(tensors)``."""
+    player = NETWORK.start([np.random.default_rng(run) for run in range(2)])
+    change(player)
+    save_policy(path / "policy.safetensors", [player], {"cell": "ppo_red", "seeds": [0, 1]})
+    return path / "policy.safetensors"
+
+
+def assign(name: str, value: float) -> Callable[[Weights], None]:
+    def change(player: Weights) -> None:
+        player[name][1, ..., 3] = value
+
+    return change
+
+
+def reshape(name: str, *shape: int) -> Callable[[Weights], None]:
+    def change(player: Weights) -> None:
+        player[name] = torch.zeros(shape)
+
+    return change
+
+
+FILES = {
+    "NaN": (assign("conv2.weight", NAN), r"conv2\.weight of player 0 holds NaN or infinite"),
+    "infinite": (assign("actor2.bias", INF), r"actor2\.bias of player 0 holds NaN or infinite"),
+    "minus infinite": (assign("critic1.weight", -INF), r"critic1\.weight .* NaN or infinite"),
+    "more units": (
+        reshape("actor1.weight", 2, 64, 65),
+        r"actor1\.weight of player 0 has shape \(64, 65\), needs \(64, 64\)",
+    ),
+    "transposed": (
+        reshape("conv1.weight", 2, 16, 12),
+        r"conv1\.weight of player 0 has shape \(16, 12\), needs \(12, 16\)",
+    ),
+    "no run axis": (
+        reshape("conv1.weight", 12, 16),
+        r"conv1\.weight of player 0 has shape \(16,\), needs \(12, 16\)",
+    ),
+    "missing layer": (
+        lambda player: player.pop("critic2.bias"),
+        r"critic2\.bias of player 0 has shape nothing, needs \(1,\)",
+    ),
+}
+
+
+@pytest.mark.parametrize(("change", "message"), FILES.values(), ids=FILES.keys())
+def test_policy_with_wrong_weights(tmp_path, change, message):
+    path = saved(tmp_path, change)
+    with pytest.raises(ValueError, match=rf"^{path}: {message}"):
+        load_policy(path, NETWORK)
+
+
+@UNCHECKED
+def test_policy_whose_layers_differ_in_the_number_of_runs(tmp_path):
+    path = saved(tmp_path, reshape("conv1.bias", 3, 16))
+    with pytest.raises(ValueError, match=rf"^{path}: conv1\.bias of player 0 .* runs"):
+        load_policy(path, NETWORK)
+
+
+@pytest.mark.parametrize("network", [GridNetwork(8), GridNetwork(2), GridNetwork(3, 6)])
+def test_policy_for_another_network(tmp_path, network):
+    path = saved(tmp_path)
+    message = rf"^{path}: \w+\.(weight|bias) of player 0 has shape \(.*\), needs \(.*\)"
+    with pytest.raises(ValueError, match=message):
+        load_policy(path, network)
+
+
+@pytest.mark.parametrize(
+    ("about", "message"),
+    [
+        ({"cell": "ppo_green"}, "was made for cell = 'ppo_red', not 'ppo_green'"),
+        ({"cell": "ppo_red", "seeds": [0]}, r"was made for seeds = \[0, 1\], not \[0\]"),
+        ({"size": 6}, "was made for size = None, not 6"),
+    ],
+)
+def test_policy_that_was_made_for_something_else(tmp_path, about, message):
+    path = saved(tmp_path)
+    with pytest.raises(ValueError, match=rf"^{path}: {message}"):
+        load_policy(path, NETWORK, about)
+
+
+@pytest.mark.parametrize("share", [0, 0.0001, 0.01, 0.5, 0.99999])
+def test_policy_cut_short(tmp_path, share):
+    path = saved(tmp_path)
+    content = path.read_bytes()
+    path.write_bytes(content[: int(share * len(content))])
+    with pytest.raises(ValueError, match=rf"^{path}: cannot be read as a policy: "):
+        load_policy(path, NETWORK)
+
+
+def test_policy_of_another_format(tmp_path):
+    path = tmp_path / "policy.safetensors"
+    torch.save({"0.conv1.weight": torch.zeros(1)}, path)
+    with pytest.raises(ValueError, match=rf"^{path}: cannot be read as a policy: "):
+        load_policy(path, NETWORK)
+
+
+def test_policy_that_does_not_exist(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"nowhere\.safetensors"):
+        load_policy(tmp_path / "nowhere.safetensors", NETWORK)
+
+
+@pytest.mark.parametrize(
+    ("tensors", "metadata"),
+    [
+        ({"0.conv1.weight": torch.zeros(1, 12, 16)}, None),
+        ({"0.conv1.weight": torch.zeros(1, 12, 16)}, {"cell": "ppo_red"}),
+        pytest.param({"weight": torch.zeros(1)}, {"about": "{}"}, marks=UNCHECKED),
+        pytest.param({}, {"about": "{}"}, marks=UNCHECKED),
+        pytest.param({"0.conv1.weight": torch.zeros(1)}, {"about": "{"}, marks=UNCHECKED),
+    ],
+    ids=["says nothing", "says something else", "foreign names", "no weights", "damaged record"],
+)
+def test_file_that_is_no_policy(tmp_path, tensors, metadata):
+    path = tmp_path / "policy.safetensors"
+    safetensors.torch.save_file(tensors, path, metadata)
+    with pytest.raises(ValueError, match=rf"^{path}: cannot be read as a policy"):
+        load_policy(path, NETWORK)

@@ -1,0 +1,460 @@
+"""The coloured-keys experiment: its protocol by hand, what networks see, and the shipped data."""
+
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from minigrid.core.constants import OBJECT_TO_IDX
+
+from ipo.colored_keys import COLORS
+from ipo.keys_experiments import (
+    MODULES,
+    Cell,
+    Keys,
+    encode,
+    evaluate,
+    exact,
+    published_protocol,
+    recolor,
+    run_cell,
+    run_curve,
+)
+from ipo.networks import GridNetwork, load_policy
+from ipo.ppo import published
+from ipo.results import provenance, stale_batches
+from ipo.tabular import TabularTask, expected_return
+
+DATA = Path(__file__).resolve().parents[2] / "data"
+RESULTS, POLICIES = DATA / "results" / "keys", DATA / "policies" / "keys"
+CELL = ["method", "train_colors", "color_encoding", "size"]
+EXACT = {"return_exact", "return_greedy", "success", "reaches_key", "unlocks_door", "entropy"}
+TINY = {
+    "num_updates": 2,
+    "num_envs": 4,
+    "num_steps": 16,
+    "minibatch_size": 32,
+    "num_epochs": 2,
+}
+
+
+# -------------------------------------------------------------------- published protocol
+
+
+def corridor(starts: list[float], horizon: int = 6) -> TabularTask:
+    """Cells in a row, the goal beyond the last: action 1 goes on, action 0 stays."""
+    cells = np.arange(len(starts))
+    goal = np.stack([cells < 0, cells == cells[-1]], axis=1)
+    return TabularTask(
+        next_state=np.stack([cells, np.minimum(cells + 1, cells[-1])], axis=1),
+        goal=goal,
+        done=goal,
+        goal_reward=1 - 0.9 * np.arange(1, horizon + 1) / horizon,
+        start=np.array(starts),
+        observation=cells[::-1].copy(),  # not in the order of states
+        images=np.zeros((len(cells), 1, 1, 1)) + cells[:, None, None, None],
+        progress=np.zeros(len(cells), dtype=int),
+        position=np.stack([cells, cells], axis=1),
+        signature=cells.astype(np.uint64),
+    )
+
+
+def slow_protocol(
+    task: TabularTask, probabilities: np.ndarray, rng: np.random.Generator
+) -> tuple[float, int]:
+    """Fifty copies, one by one, until a hundred episodes are over; also how many are."""
+
+    def begin(uniform: float) -> int:
+        return int((uniform >= np.cumsum(task.start)).sum())
+
+    states, ages = [begin(u) for u in rng.random(50)], [0] * 50
+    returns = []
+    while len(returns) < 100:
+        chances, starts = rng.random(50), rng.random(50)
+        for copy in range(50):
+            below = np.cumsum(probabilities[task.observation[states[copy]]])
+            action = int((chances[copy] >= below[:-1]).sum())
+            reached = task.goal[states[copy], action]
+            states[copy] = task.next_state[states[copy], action]
+            ages[copy] += 1
+            if reached or ages[copy] == task.horizon:
+                returns.append(task.goal_reward[ages[copy] - 1] if reached else 0)
+                states[copy], ages[copy] = begin(starts[copy]), 0
+    return float(np.mean(returns)), len(returns)
+
+
+@pytest.mark.parametrize("go", [0.3, 0.6, 0.95])
+def test_published_protocol_by_hand(go):
+    task = corridor([0.25, 0.25, 0.5])
+    probabilities = np.array([[1 - go, go], [1 - go / 2, go / 2], [0.5, 0.5]])
+    logits = torch.tensor(np.stack([probabilities] * 3)).log()
+    found = published_protocol(task, logits, [np.random.default_rng(run) for run in range(3)])
+    slow = [slow_protocol(task, probabilities, np.random.default_rng(run)) for run in range(3)]
+    assert found == pytest.approx([mean for mean, _ in slow], rel=1e-6)
+    assert all(count >= 100 for _, count in slow)
+
+
+def test_protocol_of_the_only_episode_there_is():
+    """Everybody reaches the goal in the second step: two rounds of fifty are over after four."""
+    logits = torch.tensor([[[-100.0, 100.0]] * 2])
+    found = published_protocol(corridor([1.0, 0.0]), logits, [np.random.default_rng(0)])
+    assert found == pytest.approx([1 - 0.9 * 2 / 6])
+
+
+def test_protocol_favours_short_episodes():
+    """Half of all episodes take one step, the others all six; 100 runs, to 10 standard errors."""
+    task = corridor([0.0, 0.0, 0.0, 0.5, 0.5])
+    policy = np.array([[0.0, 1.0]] + [[1.0, 0.0]] * 4)  # from the last cell alone
+    (value,), _ = expected_return(task, policy[None])
+    assert value == pytest.approx(0.5 * (1 - 0.9 / 6))
+    logits = torch.tensor(np.stack([policy] * 100)).clamp(1e-30).log()
+    found = published_protocol(task, logits, [np.random.default_rng(run) for run in range(100)])
+    assert found.mean() - value > 10 * found.std() / 10
+
+
+def test_protocol_of_the_coloured_keys_by_hand(keys):
+    """The numbers of observations are those of the colour, not those of a pooled table."""
+    task = keys["blue"]
+    rng = np.random.default_rng(0)
+    votes = np.zeros((289, 7))
+    best = np.array([2, 2, 5, 3, 0, 1])
+    votes[np.arange(289), best[rng.integers(0, 6, size=289)]] = 1
+    probabilities = 0.3 * votes + 0.1
+    logits = torch.tensor(probabilities)[None].log()
+    (found,) = published_protocol(task, logits, [np.random.default_rng(1)])
+    assert 0 < found < 1
+    assert found == pytest.approx(slow_protocol(task, probabilities, np.random.default_rng(1))[0])
+
+
+# ----------------------------------------------------------------------------- encodings
+
+
+@pytest.mark.parametrize(("name", "channels"), [("integer", 3), ("one_hot", 8), ("none", 2)])
+def test_encodings_by_hand(keys, name, channels):
+    images = keys["purple"].images
+    encoded = encode(images, name)
+    assert encoded.shape == (289, 7, 7, channels) and encoded.dtype == torch.float32
+    for k, i, j in [(0, 0, 0), (5, 3, 6), (100, 3, 5), (288, 2, 4), (17, 4, 4)]:
+        kind, color, state = (float(code) for code in images[k, i, j])
+        expected = {
+            "integer": [kind, color, state],
+            "one_hot": [kind, state] + [float(color == code) for code in range(6)],
+            "none": [kind, state],
+        }
+        assert encoded[k, i, j].tolist() == expected[name]
+
+
+def test_without_color_all_domains_look_the_same(keys):
+    seen = [encode(keys[color].images[keys[color].observation], "none") for color in COLORS]
+    assert all(torch.equal(images, seen[0]) for images in seen)
+    assert not torch.equal(
+        *(encode(keys[color].images[keys[color].observation], "integer") for color in COLORS[:2])
+    )
+
+
+def test_recoloured_images_are_those_of_the_other_domain(keys):
+    grey, red = (keys[color].images[keys[color].observation] for color in ("grey", "red"))
+    assert np.array_equal(recolor(grey, {"key": 0, "door": 0}), red)
+    before = grey.copy()
+    key_only = recolor(grey, {"key": 9})
+    assert np.array_equal(grey, before)
+    changed = grey[..., 0] == OBJECT_TO_IDX["key"]
+    assert (key_only[changed][:, 1] == 9).all()
+    assert np.array_equal(key_only[~changed], grey[~changed])
+
+
+# ---------------------------------------------------------------------------- evaluation
+
+
+def tiny_cell(method: str, **options) -> Cell:
+    return Cell(method, published(method, **TINY), **options)
+
+
+@pytest.fixture(scope="module")
+def trained(tables) -> tuple[Keys, list]:
+    task = Keys(tables)
+    *_, (_, players) = task.train(tiny_cell("ipo"), [0, 1])
+    return task, players
+
+
+def test_exact_metrics_are_those_of_the_average_policy(trained):
+    task, players = trained
+    metrics = exact(task, players)
+    assert metrics.keys() == {(color, name) for color in COLORS for name in EXACT}
+    table = task.tasks["yellow"]
+    doubled = [{name: w.detach().double() for name, w in player.items()} for player in players]
+    outputs = [
+        GridNetwork()(player, torch.tensor(table.images).double().expand(2, 289, 7, 7, 3))[0]
+        for player in doubled
+    ]
+    policy = (sum(outputs) / 2).softmax(-1).numpy()
+    returns, success = expected_return(table, policy)
+    assert metrics["yellow", "return_exact"] == pytest.approx(returns, rel=1e-10)
+    assert metrics["yellow", "success"] == pytest.approx(success, rel=1e-10)
+    entropy = -(policy * np.log(policy)).sum(-1).mean(-1)
+    assert metrics["yellow", "entropy"] == pytest.approx(entropy, rel=1e-10)
+    greedy = (policy == policy.max(-1, keepdims=True)).astype(float)
+    assert metrics["yellow", "return_greedy"] == pytest.approx(expected_return(table, greedy)[0])
+    steps = [metrics["yellow", name] for name in ("reaches_key", "unlocks_door", "success")]
+    assert (steps[0] > steps[1]).all() and (steps[1] > steps[2]).all()
+
+
+def test_evaluation_of_a_run_does_not_depend_on_the_others(trained):
+    task, players = trained
+    second = [{name: weight[1:] for name, weight in player.items()} for player in players]
+    together, alone = evaluate(task, players, [0, 1]), evaluate(task, second, [1])
+    assert together.keys() == alone.keys()
+    for key, values in alone.items():
+        assert together[key][1:] == pytest.approx(values, rel=1e-9), key
+
+
+@pytest.mark.parametrize(
+    ("method", "options"),
+    [
+        ("ppo", {}),
+        ("ipo", {"color_encoding": "one_hot"}),
+        ("ensemble", {"train_colors": ("red", "yellow"), "color_encoding": "none"}),
+    ],
+)
+def test_rows_and_policies_of_a_cell(tmp_path, tables, method, options):
+    cell = tiny_cell(method, **options)
+    rows = run_cell(cell, [0, 1], tables, tmp_path)
+    assert list(rows.columns) == [*CELL, "run", "domain", "metric", "value"]
+    assert not rows.duplicated([*CELL, "run", "domain", "metric"]).any()
+    assert len(rows) == 2 * 6 * 7
+    assert set(rows["metric"]) == EXACT | {"return_published_protocol"}
+    assert rows[CELL].drop_duplicates().to_dict("records") == [cell.columns]
+    assert np.isfinite(rows["value"]).all()
+
+    (path,) = tmp_path.iterdir()
+    assert path.name == f"{cell.name}.safetensors"
+    task = Keys(tables, cell.color_encoding)
+    players, about = load_policy(path, task.network, {"cell": cell.name})
+    assert about["seeds"] == [0, 1]
+    returns = rows[rows["metric"] == "return_exact"].set_index(["domain", "run"])["value"]
+    for (color, metric), values in exact(task, players).items():
+        if metric == "return_exact":
+            assert returns[color].tolist() == pytest.approx(values, rel=1e-9)
+
+
+def test_later_runs_do_not_overwrite_the_first_policies(tmp_path, tables):
+    cell = tiny_cell("ppo")
+    run_cell(cell, [1], tables, tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_curve_begins_before_training_and_ends_where_the_run_ends(tables):
+    cell = tiny_cell("ppo")
+    curve = run_curve(cell, [0], tables)
+    assert list(curve.columns) == [*CELL, "frames", "run", "domain", "metric", "value"]
+    assert sorted(curve["frames"].unique()) == [0, 64, 128]
+    index = ["domain", "metric", "run"]
+    last = curve[curve["frames"] == 128].set_index(index)["value"]
+    rows = run_cell(cell, [0], tables).set_index(index)["value"]
+    assert last.to_dict() == pytest.approx(rows[last.index].to_dict(), rel=1e-9)
+
+
+# -------------------------------------------------------------------------- shipped rows
+
+TWO, THREE, INSIDE = "red+green", "red+green+blue", "red+yellow"
+MAIN = {(name, TWO, "integer", 5): 100 for name in ("ppo", "ipo", "ppo_lr5e-4", "ipo_lr1e-3")}
+MAIN |= {("ensemble", TWO, "integer", 5): 100}
+VARIANTS = {
+    (method, TWO, encoding, 5): 50
+    for method in ("ppo", "ipo", "ensemble")
+    for encoding in ("one_hot", "none")
+}
+for method in ("ppo", "ipo"):
+    VARIANTS |= {
+        (f"{method}_3colors", THREE, "integer", 5): 50,
+        (f"{method}_inside", INSIDE, "integer", 5): 50,
+        (f"{method}_normalized", TWO, "integer", 5): 50,
+    }
+SHIPPED = {
+    "main": MAIN,
+    "variants": VARIANTS,
+    "larger": {(method, TWO, "integer", 6): 30 for method in ("ppo", "ipo")},
+    "curves": {(method, TWO, "integer", 5): 30 for method in ("ppo", "ipo", "ensemble")},
+}
+CELLS = [(name, *cell) for name, cells in SHIPPED.items() for cell in cells]
+LEARNING_RATES = {
+    "ppo": 1e-3,
+    "ipo": 5e-4,
+    "ensemble": 5e-4,
+    "ppo_lr5e-4": 5e-4,
+    "ipo_lr1e-3": 1e-3,
+}
+
+
+@pytest.fixture(scope="module")
+def shipped() -> dict[str, pd.DataFrame]:
+    return {name: pd.read_csv(RESULTS / f"{name}.csv") for name in SHIPPED}
+
+
+def test_every_shipped_file_is_tested_here():
+    assert {path.stem for path in RESULTS.glob("*.csv")} == SHIPPED.keys()
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_every_shipped_run_is_there_with_every_metric_in_every_color(shipped, name):
+    rows = shipped[name]
+    counted = rows.groupby(CELL)["run"].agg(lambda runs: sorted(set(runs)))
+    assert counted.to_dict() == {cell: list(range(n)) for cell, n in SHIPPED[name].items()}
+    metrics = EXACT if name == "curves" else EXACT | {"return_published_protocol"}
+    keys = [column for column in rows.columns if column != "value"]
+    assert not rows.duplicated(keys).any()
+    num_moments = 1
+    if name == "curves":
+        assert sorted(rows["frames"].unique()) == [6144 * update for update in range(21)]
+        num_moments = 21
+    assert set(rows["domain"]) == set(COLORS) and set(rows["metric"]) == metrics
+    num_runs = sum(SHIPPED[name].values())
+    assert len(rows) == num_runs * len(COLORS) * len(metrics) * num_moments
+    assert np.isfinite(rows["value"]).all()
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_shipped_rows_are_whole_and_come_from_todays_code(name):
+    assert provenance(RESULTS, name)  # checks every batch against its rows
+    assert stale_batches(RESULTS, name, MODULES) == []
+
+
+def settings_of(label: str, color_encoding: str) -> dict:
+    """The settings that an arm's name stands for."""
+    method = label.split("_")[0]
+    learning_rate = LEARNING_RATES.get(label, LEARNING_RATES[method])
+    normalize = "minibatch" if label.endswith("_normalized") else "none"
+    return asdict(published(method, learning_rate=learning_rate, normalize_advantages=normalize))
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_shipped_rows_are_of_the_published_settings(name):
+    for batch in provenance(RESULTS, name):
+        label, encoding = batch["columns"]["method"], batch["columns"]["color_encoding"]
+        assert batch["cell"]["settings"] == settings_of(label, encoding)
+        assert "+".join(batch["cell"]["train_colors"]) == batch["columns"]["train_colors"]
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_shipped_values_are_possible(shipped, name):
+    values = shipped[name].pivot_table(
+        index=[c for c in shipped[name].columns if c not in ("metric", "value")],
+        columns="metric",
+        values="value",
+    )
+    best = 0.9646 if name != "larger" else 1
+    assert (values["return_exact"] >= 0).all() and (values["return_exact"] <= best).all()
+    assert (values["return_exact"] <= values["success"]).all()
+    assert (values["success"] <= values["unlocks_door"] + 1e-9).all()
+    assert (values["unlocks_door"] <= values["reaches_key"] + 1e-9).all()
+    assert values["entropy"].between(0, np.log(7)).all()
+
+
+def test_shipped_curves_end_where_the_shipped_runs_end(shipped):
+    """The same runs, to what the order of sums can change: training colours, to two digits."""
+    curves, main = shipped["curves"], shipped["main"]
+    index = ["method", "run", "domain"]
+
+    def returns(rows: pd.DataFrame) -> pd.Series:
+        return rows[rows["metric"] == "return_exact"].set_index(index)["value"]
+
+    last = returns(curves[curves["frames"] == 122_880])
+    difference = (last - returns(main)).dropna()
+    assert len(difference) == 3 * 30 * 6
+    trained_on = difference[difference.index.get_level_values("domain").isin(["red", "green"])]
+    assert abs(trained_on.mean()) < 0.005
+
+
+# ------------------------------------------------------------------------ shipped policies
+
+POLICY_CELLS = [cell for cell in CELLS if cell[0] != "curves"]
+
+
+def test_every_arm_ships_its_policies():
+    expected = {"_".join(map(str, cell[1:])) for cell in POLICY_CELLS}
+    assert {path.stem for path in POLICIES.iterdir()} == expected
+
+
+@pytest.fixture(scope="module")
+def keys_of(tables) -> dict[tuple, Keys]:
+    """The task by encoding and size; each is made once."""
+    return {
+        (encoding, size): Keys(tables, encoding, size)
+        for encoding, size in sorted({cell[3:] for cell in POLICY_CELLS})
+        if size == 5
+    }
+
+
+def shipped_policy(cell: tuple, network: GridNetwork) -> list:
+    """Players of the first ten runs."""
+    name = "_".join(map(str, cell[1:]))
+    path = POLICIES / f"{name}.safetensors"
+    players, about = load_policy(path, network, {"cell": name})
+    assert about["seeds"] == list(range(10))
+    assert {len(weight) for player in players for weight in player.values()} == {10}
+    return players
+
+
+def shipped_values(shipped: dict, cell: tuple, color: str, metric: str) -> list[float]:
+    name, *columns = cell
+    rows = shipped[name]
+    for column, value in zip(CELL, columns, strict=True):
+        rows = rows[rows[column] == value]
+    rows = rows[(rows["domain"] == color) & (rows["metric"] == metric) & (rows["run"] < 10)]
+    return rows.sort_values("run")["value"].tolist()
+
+
+@pytest.mark.parametrize(
+    "cell",
+    [cell for cell in POLICY_CELLS if cell[4] == 5],
+    ids=lambda cell: "_".join(map(str, cell[1:])),
+)
+def test_shipped_policies_have_the_shipped_returns(shipped, keys_of, cell):
+    task = keys_of[cell[3:]]
+    players = shipped_policy(cell, task.network)
+    num_players = {"ppo": 1, "ipo": cell[2].count("+") + 1, "ensemble": 2}
+    assert len(players) == num_players[cell[1].split("_")[0]]
+    for color, table in task.tasks.items():
+        policy = task.logits(players, table.images).softmax(-1).numpy()
+        returns, success = expected_return(table, policy)
+        for metric, values in (("return_exact", returns), ("success", success)):
+            expected = shipped_values(shipped, cell, color, metric)
+            assert values == pytest.approx(expected, rel=0, abs=1e-6), (color, metric)
+
+
+@pytest.mark.parametrize("method", ["ppo", "ipo"])
+def test_shipped_policies_have_every_shipped_metric(shipped, keys_of, method):
+    """Greedy returns, subtasks, entropy, and the published protocol with its random draws."""
+    cell = ("main", method, TWO, "integer", 5)
+    task = keys_of[cell[3:]]
+    metrics = evaluate(task, shipped_policy(cell, task.network), list(range(10)))
+    assert len(metrics) == 6 * 7
+    for (color, metric), values in metrics.items():
+        expected = shipped_values(shipped, cell, color, metric)
+        assert values == pytest.approx(expected, rel=0, abs=1e-6), (color, metric)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["ppo", "ipo"])
+def test_shipped_policies_of_larger_grids_have_the_shipped_returns(shipped, tables, method):
+    cell, task = ("larger", method, TWO, "integer", 6), Keys(tables, size=6)
+    metrics = exact(task, shipped_policy(cell, task.network))
+    for (color, metric), values in metrics.items():
+        expected = shipped_values(shipped, cell, color, metric)
+        assert values == pytest.approx(expected, rel=0, abs=1e-6), (color, metric)
+
+
+@pytest.mark.slow
+def test_runs_trained_today_are_distributed_as_the_shipped_ones(shipped, tables):
+    """Same seeds, other order of sums: returns on the training colours, ten runs of PPO."""
+    rows = run_cell(Cell("ppo", published("ppo")), list(range(10)), tables)
+    exact_rows = rows[rows["metric"] == "return_exact"]
+    for color in ("red", "green"):
+        ours = exact_rows[exact_rows["domain"] == color]["value"]
+        theirs = shipped["main"].query(
+            "method == 'ppo' and metric == 'return_exact' and domain == @color"
+        )["value"]
+        error = np.hypot(ours.sem(), theirs.sem())
+        assert abs(ours.mean() - theirs.mean()) < 4 * error
