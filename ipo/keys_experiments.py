@@ -49,6 +49,10 @@ class Cell:
         check_choice("color_encoding", self.color_encoding, ENCODINGS)
         for color in self.train_colors:
             check_choice("train_colors", color, COLORS)
+        if not self.train_colors:
+            raise ValueError("train_colors = (): must name at least one colour")
+        if len(set(self.train_colors)) < len(self.train_colors):
+            raise ValueError(f"train_colors = {self.train_colors}: must not name a colour twice")
 
     @property
     def name(self) -> str:
@@ -180,6 +184,7 @@ def published_protocol(
 
 def encode(images: np.ndarray, color_encoding: str) -> torch.Tensor:
     """MiniGrid's images ``[K, 7, 7, 3]`` as the network's input ``[K, 7, 7, C]``."""
+    check_choice("color_encoding", color_encoding, ENCODINGS)
     images = torch.tensor(images)
     if color_encoding == "integer":
         return images.float()

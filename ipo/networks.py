@@ -186,13 +186,13 @@ def load_policy(
     try:
         with safetensors.safe_open(path, "pt") as file:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-            found = json.loads(file.metadata()["about"])
-    except (safetensors.SafetensorError, TypeError, KeyError) as error:
+            found = dict(json.loads(file.metadata()["about"]))
+        num_players = 1 + max(int(name.split(".")[0]) for name in tensors)
+    except (safetensors.SafetensorError, TypeError, KeyError, ValueError) as error:
         raise ValueError(f"{path}: cannot be read as a policy: {error}") from error
     for name, value in (about or {}).items():
         if found.get(name) != value:
             raise ValueError(f"{path}: was made for {name} = {found.get(name)!r}, not {value!r}")
-    num_players = 1 + max(int(name.split(".")[0]) for name in tensors)
     players: list[Weights] = [{} for _ in range(num_players)]
     for d, player in enumerate(players):
         for name, shape in network.weight_shapes.items():
@@ -200,6 +200,11 @@ def load_policy(
             if weight is None or tuple(weight.shape[1:]) != shape:
                 have = "nothing" if weight is None else tuple(weight.shape[1:])
                 raise ValueError(f"{path}: {name} of player {d} has shape {have}, needs {shape}")
+            num_runs = len(next(iter(players[0].values()), weight))
+            if len(weight) != num_runs:
+                raise ValueError(
+                    f"{path}: {name} of player {d} has {len(weight)} runs, must have {num_runs}"
+                )
             if not bool(torch.isfinite(weight).all()):
                 raise ValueError(f"{path}: {name} of player {d} holds NaN or infinite weights")
             player[name] = weight

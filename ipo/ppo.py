@@ -10,6 +10,7 @@ Axes: R runs, E players, N copies of the environments, T steps, F = N T frames.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -95,6 +96,8 @@ class Settings:
             check_count("num_minibatches", self.num_minibatches)
         for name in ("learning_rate", "adam_epsilon", "clip", "max_gradient_norm", "reward_clip"):
             check_number(name, getattr(self, name), above=0)
+            if math.isinf(getattr(self, name)):
+                raise ValueError(f"{name} = {getattr(self, name)}: must be finite")
         for name in ("value_weight", "entropy_weight"):
             check_number(name, getattr(self, name), least=0)
         for name in ("discount", "gae_lambda"):
@@ -207,6 +210,7 @@ class Training:
         seeds: Sequence[int],
     ) -> None:
         check_counts("seeds", seeds, minimum=0)
+        check_count("num_domains", num_domains)
         owned = settings.domains_of_players(num_domains)
         copies = settings.copies_of_players(num_domains)
         for own in copies:

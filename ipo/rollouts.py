@@ -115,9 +115,10 @@ def collect(
         actions = distribution.sample(parameters, generators)
         step = environments.step(actions)
         beyond = torch.zeros_like(values)
-        if time_outs == "bootstrap" and bool(step.truncated.any()):
+        timed_out = step.truncated & ~step.terminated
+        if time_outs == "bootstrap" and bool(timed_out.any()):
             # The task goes on after a time-out: what it is worth from there is part of the return.
-            beyond = discount * step.truncated * policy(step.last_observation)[1]
+            beyond = torch.where(timed_out, discount * policy(step.last_observation)[1], beyond)
         steps.append(
             (
                 observation,

@@ -144,8 +144,10 @@ def load_or_tabulate(make_env: Callable[..., Env], folder: str | Path, **options
 
     The name of the file holds a hash of all that decides its content.
     """
-    module = make_env.__module__.rpartition(".")[2]
-    origin = [make_env.__qualname__, options, version("minigrid"), source_hash(["tabular", module])]
+    package, _, module = make_env.__module__.rpartition(".")
+    own = ["tabular", module] if package == "ipo" else ["tabular"]
+    made_by = f"{make_env.__module__}.{make_env.__qualname__}"
+    origin = [made_by, options, version("minigrid"), source_hash(own)]
     digest = hashlib.sha256(json.dumps(origin, sort_keys=True).encode()).hexdigest()[:16]
     path = Path(folder) / f"{digest}.npz"
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -181,6 +183,9 @@ class TabularDomains:
         self.goal_reward = tasks[0].goal_reward
         # Starts of domain d as cumulative probabilities over all states, from d to d + 1.
         self.starts = np.cumsum(np.concatenate([task.start for task in tasks]))
+        possible = [np.flatnonzero(task.start) for task in tasks]
+        self.first_start = np.array([own[0] + n for own, n in zip(possible, first, strict=False)])
+        self.last_start = np.array([own[-1] + n for own, n in zip(possible, first, strict=False)])
 
     def __call__(
         self,
@@ -230,7 +235,11 @@ class TabularEnvironments:
 
     def _starts(self) -> np.ndarray:
         uniform = np.stack([generator.random(len(self.domains)) for generator in self.generators])
-        return np.searchsorted(self.table.starts, self.domains + uniform, side="right")
+        found = np.searchsorted(self.table.starts, self.domains + uniform, side="right")
+        # The sums are rounded: a draw next to 0 or 1 could lead into the next domain.
+        return np.clip(
+            found, self.table.first_start[self.domains], self.table.last_start[self.domains]
+        )
 
 
 def expected_return(task: TabularTask, policy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -1,6 +1,6 @@
 """The coloured-keys experiment: its protocol by hand, what networks see, and the shipped data."""
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -275,7 +275,11 @@ for method in ("ppo", "ipo"):
 SHIPPED = {
     "main": MAIN,
     "variants": VARIANTS,
-    "larger": {(method, TWO, "integer", 6): 30 for method in ("ppo", "ipo")},
+    "larger": {
+        (f"{method}{length}", TWO, "integer", 6): 30
+        for method in ("ppo", "ipo")
+        for length in ("", "_long")
+    },
     "curves": {(method, TWO, "integer", 5): 30 for method in ("ppo", "ipo", "ensemble")},
 }
 CELLS = [(name, *cell) for name, cells in SHIPPED.items() for cell in cells]
@@ -326,7 +330,8 @@ def settings_of(label: str, color_encoding: str) -> dict:
     method = label.split("_")[0]
     learning_rate = LEARNING_RATES.get(label, LEARNING_RATES[method])
     normalize = "minibatch" if label.endswith("_normalized") else "none"
-    return asdict(published(method, learning_rate=learning_rate, normalize_advantages=normalize))
+    settings = published(method, learning_rate=learning_rate, normalize_advantages=normalize)
+    return asdict(replace(settings, num_updates=80 if label.endswith("_long") else 20))
 
 
 @pytest.mark.parametrize("name", SHIPPED)

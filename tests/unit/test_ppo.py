@@ -422,14 +422,7 @@ def scripted_rollout(ends: Sequence[str], time_outs: str) -> tuple[Rollout, Tens
         ("terminated", "bootstrap", 0),
         ("terminated", "terminal", 0),
         ("terminated, truncated", "terminal", 0),
-        pytest.param(
-            "terminated, truncated",
-            "bootstrap",
-            0,
-            marks=pytest.mark.xfail(
-                strict=True, reason="the goal in the last step of the horizon is bootstrapped"
-            ),
-        ),
+        ("terminated, truncated", "bootstrap", 0),  # the goal in the last step of the horizon
     ],
 )
 def test_future_after_the_end_of_a_step(end, time_outs, future):

@@ -259,19 +259,14 @@ def test_lockstep_with_minigrid(explored, index_of, keys, colors):
     assert num_goals >= 8 and num_timeouts >= 3
 
 
-ROUNDING = pytest.mark.xfail(
-    strict=True, reason="the starts' cumulative probabilities are rounded: one draw in 10^15"
-)
-
-
 @pytest.mark.parametrize(
     "uniform",
     [
-        pytest.param(0.0, marks=ROUNDING),
+        0.0,
         1e-9,
         0.5,
         1 - 1e-9,
-        pytest.param(np.nextafter(1, 0), marks=ROUNDING),
+        np.nextafter(1, 0),
     ],
 )
 def test_any_draw_starts_in_the_domain_of_the_copy(keys, uniform):
