@@ -188,7 +188,10 @@ def test_drawn_graph_has_the_nodes_and_edges_of_the_model():
             "is a cycle, must be acyclic",
         ),
         (lambda: SCM({"X": Linear({"X": 1})}), "X -> X is a cycle"),
-        (lambda: SCM({"X1": Linear({}), "Y": Linear({"X2": 1})}), "parent of Y = 'X2': must be one of X1, Y"),
+        (
+            lambda: SCM({"X1": Linear({}), "Y": Linear({"X2": 1})}),
+            "parent of Y = 'X2': must be one of X1, Y",
+        ),
         (lambda: CHAIN.do(W=1.0), "intervention on = 'W': must be one of X, Y, Z"),
         (lambda: CHAIN.with_noise(W=Normal()), "intervention on = 'W': must be one of"),
         (lambda: CHAIN.intervene(X=Linear({"Z": 1})), "is a cycle"),
