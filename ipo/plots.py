@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -10,6 +10,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from ipo.scm import SCM
 from ipo.stats import bootstrap_interval
 
 # Colours of Okabe and Ito, which colour-blind readers can tell apart; markers for print.
@@ -23,6 +24,12 @@ STYLES = {
     "ppo": ("PPO", "#D55E00", "o"),
     "ipo": ("IPO", "#0072B2", "^"),
     "ensemble": ("ensemble, pooled data", "#E69F00", "s"),
+    "erm": ("ERM", "#D55E00", "o"),
+    "icp": ("ICP", "#009E73", "D"),
+    "irmv1": ("IRMv1", "#CC79A7", "P"),
+    "vrex": ("V-REx", "#E69F00", "s"),
+    "irm_game_fixed_phi": ("IRM-Games, fixed Φ", "#0072B2", "^"),
+    "irm_game_variable_phi": ("IRM-Games, variable Φ", "#56B4E9", "v"),
 }
 
 STYLE = {
@@ -132,3 +139,52 @@ def trajectories(energies: dict[str, np.ndarray], oracle: str) -> Figure:
     ax.set(yscale="log", xlabel="time step", ylabel="$|s_t|^2$", ylim=(1e-6, None))
     ax.legend()
     return fig
+
+
+def causal_graph(
+    ax: Axes,
+    model: SCM,
+    positions: Mapping[str, tuple[float, float]],
+    labels: Mapping[str, str] | None = None,
+    hidden: Collection[str] = (),
+    changed: Collection[str] = (),
+) -> None:
+    """The graph of a structural causal model: a circle for each variable, an arrow to each effect.
+
+    Nodes and edges come from the model; only where they stand is given. Hidden variables have
+    dashed circles, those intervened on are filled.
+
+    Raises:
+        ValueError: a variable without a position.
+    """
+    missing = [name for name in model.assignments if name not in positions]
+    if missing:
+        raise ValueError(f"positions: has none for {missing[0]!r}, must have one for each variable")
+    for cause, effect in model.edges:
+        ax.annotate(
+            "",
+            xy=positions[effect],
+            xytext=positions[cause],
+            arrowprops={"arrowstyle": "-|>", "color": "0.25", "shrinkA": 17, "shrinkB": 17},
+            gid=f"{cause}->{effect}",
+        )
+    for name in model.assignments:
+        x, y = positions[name]
+        face = "#F0E442" if name in changed else "white"
+        line = "--" if name in hidden else "-"
+        # Drawn as a marker, so that it stays round and as large as the letters in it.
+        ax.scatter(
+            x, y, s=900, facecolor=face, edgecolor="black", linestyle=line, zorder=2, gid=name
+        )
+        text = (labels or {}).get(name, f"${name}$")
+        ax.text(x, y, text, ha="center", va="center", zorder=3)
+    ax.margins(0.25)
+    ax.axis("off")
+
+
+def interval_lines(
+    ax: Axes, rows: pd.DataFrame, metric: str, x: str, methods: Sequence[str], baseline: float
+) -> None:
+    """:func:`draw_metric` with a dashed line for a predictor from the causes."""
+    draw_metric(ax, rows, metric, x, [m for m in methods if m in set(rows["method"])])
+    ax.axhline(baseline, color="black", lw=1, ls="--", label="from the causes")

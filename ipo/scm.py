@@ -1,0 +1,241 @@
+"""Structural causal models: named variables, assignments, noise, interventions and the graph.
+
+A structural causal model (SCM) is a list of assignments, one for each variable,
+
+    x_j <- f_j(Pa(x_j), eta_j),        eta_1, ..., eta_m independent.
+
+An intervention replaces some of them and leaves the others as they are.
+
+Source: Definitions 1 and 2 of Sonar, Pacelli and Majumdar (2021), after Peters et al. (2017).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from graphlib import CycleError, TopologicalSorter
+from typing import Protocol
+
+import numpy as np
+import pandas as pd
+import scipy.stats
+
+from ipo.checks import check_choice, check_count, check_number
+
+Noise = Callable[[np.random.Generator, int], np.ndarray]
+
+
+@dataclass(frozen=True)
+class Normal:
+    """Noise ``N(mean, std^2)``; ``std = 0`` is a constant."""
+
+    mean: float = 0.0
+    std: float = 1.0
+
+    def __post_init__(self) -> None:
+        check_number("mean", self.mean)
+        check_number("std", self.std, least=0)
+
+    def __call__(self, rng: np.random.Generator, size: int) -> np.ndarray:
+        return self.mean + self.std * rng.standard_normal(size)
+
+
+def uniform(rng: np.random.Generator, size: int) -> np.ndarray:
+    """Noise that is uniform on [0, 1); a threshold makes any binary variable of it."""
+    return rng.random(size)
+
+
+class Assignment(Protocol):
+    """How a variable comes about: from its parents' values and a noise of its own."""
+
+    noise: Noise
+
+    @property
+    def parents(self) -> tuple[str, ...]: ...
+
+    def __call__(self, values: Mapping[str, np.ndarray], noise: np.ndarray) -> np.ndarray: ...
+
+
+@dataclass(frozen=True)
+class Linear:
+    """``x <- sum_p coefficients[p] p + noise``."""
+
+    coefficients: Mapping[str, float]
+    noise: Normal = Normal()
+
+    def __post_init__(self) -> None:
+        for parent, coefficient in self.coefficients.items():
+            check_number(f"coefficients[{parent!r}]", coefficient)
+
+    @property
+    def parents(self) -> tuple[str, ...]:
+        return tuple(self.coefficients)
+
+    def __call__(self, values: Mapping[str, np.ndarray], noise: np.ndarray) -> np.ndarray:
+        return sum((c * values[p] for p, c in self.coefficients.items()), start=noise)
+
+
+@dataclass(frozen=True)
+class Mechanism:
+    """``x <- function(*parents, noise)``, any function of arrays ``[num_samples]``."""
+
+    parents: tuple[str, ...]
+    function: Callable[..., np.ndarray]
+    noise: Noise = Normal()
+
+    def __call__(self, values: Mapping[str, np.ndarray], noise: np.ndarray) -> np.ndarray:
+        return self.function(*(values[parent] for parent in self.parents), noise)
+
+
+def bernoulli(parents: Sequence[str], probability: Callable[..., np.ndarray]) -> Mechanism:
+    """A binary variable that is 1 with ``probability(*parents)``."""
+    return Mechanism(tuple(parents), lambda *pa: (pa[-1] < probability(*pa[:-1])) * 1.0, uniform)
+
+
+class SCM:
+    """A structural causal model.
+
+    Args:
+        assignments: ``{variable: assignment}``.
+
+    Raises:
+        ValueError: no variable, a parent that is no variable, a cycle.
+    """
+
+    def __init__(self, assignments: Mapping[str, Assignment]) -> None:
+        if not assignments:
+            raise ValueError("assignments = {}: must not be empty")
+        self.assignments = dict(assignments)
+        for name in self.assignments:
+            for parent in self.parents(name):
+                check_choice(f"parent of {name}", parent, self.assignments)
+        try:
+            graph = {name: self.parents(name) for name in self.assignments}
+            self.order = tuple(TopologicalSorter(graph).static_order())  # causes come first
+        except CycleError as error:
+            raise ValueError(
+                f"assignments: {' -> '.join(error.args[1])} is a cycle, must be acyclic"
+            ) from None
+
+    def parents(self, name: str) -> tuple[str, ...]:
+        """The direct causes of a variable."""
+        check_choice("variable", name, self.assignments)
+        return tuple(self.assignments[name].parents)
+
+    @property
+    def edges(self) -> list[tuple[str, str]]:
+        """The graph: a pair ``(cause, effect)`` for every direct cause."""
+        return [(parent, name) for name in self.assignments for parent in self.parents(name)]
+
+    def descendants(self, name: str) -> set[str]:
+        """All variables that an intervention on ``name`` can change, itself aside."""
+        check_choice("variable", name, self.assignments)
+        found = {name}
+        for other in self.order:
+            if found & set(self.parents(other)):
+                found.add(other)
+        return found - {name}
+
+    def sample(self, num_samples: int, rng: np.random.Generator) -> pd.DataFrame:
+        """Independent samples, a column for each variable.
+
+        Every variable draws from a stream of its own. So two models with the same ``rng`` differ
+        only in what follows from the assignments that differ.
+
+        Raises:
+            ValueError: an assignment that returns another shape than ``[num_samples]``, or NaN.
+        """
+        check_count("num_samples", num_samples)
+        streams = dict(zip(self.assignments, rng.spawn(len(self.assignments)), strict=True))
+        values: dict[str, np.ndarray] = {}
+        for name in self.order:
+            assignment = self.assignments[name]
+            value = assignment(values, assignment.noise(streams[name], num_samples))
+            if np.shape(value) != (num_samples,):
+                raise ValueError(f"{name}: has shape {np.shape(value)}, must have {(num_samples,)}")
+            if np.isnan(value).any():
+                raise ValueError(f"{name}: its assignment returned NaN, must return numbers")
+            values[name] = value
+        return pd.DataFrame({name: values[name] for name in self.assignments})
+
+    def intervene(self, **assignments: Assignment) -> SCM:
+        """The model with other assignments (a soft intervention); parents may change, too."""
+        for name in assignments:
+            check_choice("intervention on", name, self.assignments)
+        return SCM(self.assignments | assignments)
+
+    def do(self, **values: float) -> SCM:
+        """The model in which variables are set to values, whatever their causes say."""
+        return self.intervene(**{name: Linear({}, Normal(v, 0.0)) for name, v in values.items()})
+
+    def with_noise(self, **noises: Noise) -> SCM:
+        """The model in which variables keep their function and get other noise."""
+        for name in noises:
+            check_choice("intervention on", name, self.assignments)
+        return self.intervene(
+            **{name: replace(self.assignments[name], noise=n) for name, n in noises.items()}
+        )
+
+
+def moments(model: SCM) -> tuple[pd.Series, pd.DataFrame]:
+    """Exact mean and covariance of a linear model ``x = B x + eta``.
+
+        mean = (I - B)^-1 E[eta],    covariance = (I - B)^-1 Cov[eta] (I - B)^-T
+
+    Raises:
+        TypeError: an assignment that is not linear.
+    """
+    names = list(model.assignments)
+    B = pd.DataFrame(0.0, names, names)
+    for name, assignment in model.assignments.items():
+        if not isinstance(assignment, Linear):
+            raise TypeError(
+                f"{name}: is a {type(assignment).__name__}, must be Linear for exact moments"
+            )
+        for parent, coefficient in assignment.coefficients.items():
+            B.loc[name, parent] = coefficient
+    noises = [model.assignments[name].noise for name in names]
+    mixing = np.linalg.inv(np.eye(len(names)) - B.to_numpy())
+    mean = mixing @ [noise.mean for noise in noises]
+    covariance = mixing @ np.diag([noise.std**2 for noise in noises]) @ mixing.T
+    return pd.Series(mean, names), pd.DataFrame(covariance, names, names)
+
+
+def population_regression(
+    covariance: pd.DataFrame, target: str, predictors: Sequence[str]
+) -> tuple[np.ndarray, float]:
+    """Coefficients of the best linear prediction of ``target``, and the variance that it leaves."""
+    for name in (target, *predictors):
+        check_choice("variable", name, covariance.columns)
+    S = list(predictors)
+    cross = covariance.loc[S, target].to_numpy()
+    coefficients = np.linalg.lstsq(covariance.loc[S, S].to_numpy(), cross, rcond=None)[0]
+    return coefficients, float(covariance.loc[target, target] - cross @ coefficients)
+
+
+def same_conditional(samples: Sequence[pd.DataFrame], target: str, given: Sequence[str]) -> float:
+    """p-value of the hypothesis that ``P(target | given)`` is the same in all domains.
+
+    Likelihood-ratio test between one linear-Gaussian regression for all domains together and one
+    for each, where N_e are the samples of a domain and N those of all:
+
+        N log s^2 - sum_e N_e log s_e^2  ~  chi^2 with (E - 1) (|given| + 2) degrees of freedom.
+
+    Raises:
+        ValueError: one domain only, a variable that is not there.
+    """
+    if len(samples) < 2:
+        raise ValueError(f"samples: has {len(samples)} domains, must have at least 2")
+    for name in (target, *given):
+        check_choice("variable", name, samples[0].columns)
+
+    def deviance(part: pd.DataFrame) -> float:
+        design = np.column_stack([np.ones(len(part)), part[list(given)]])
+        y = part[target].to_numpy()
+        residual = y - design @ np.linalg.lstsq(design, y, rcond=None)[0]
+        # A variable that was set to a constant leaves no variance; its logarithm stays finite.
+        return len(part) * np.log(max(np.mean(residual**2), 1e-12))
+
+    statistic = deviance(pd.concat(samples)) - sum(map(deviance, samples))
+    degrees = (len(samples) - 1) * (len(given) + 2)
+    return float(scipy.stats.chi2.sf(statistic, degrees))
