@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ipo.checks import check_choice, check_count, check_number
-from ipo.game import average, best_response_round, new_players, split_players
+from ipo.game import average, best_response_round, nash_gap, new_players, split_players
 from ipo.optimizers import descend, make_optimizer
 
 METHODS = ("pooled", "ipo", "ensemble", "separate")
@@ -61,7 +61,9 @@ class Settings:
 def play(
     costs: Sequence[Cost], start: Tensor, settings: Settings, checkpoints: Sequence[int] = ()
 ) -> Iterator[tuple[int, Tensor]]:
-    """Play the game of these domains; all players begin at ``start [R, P]``.
+    """Play the game of these domains.
+
+    All players begin at ``start [R, P]``, or each at its own ``start [R, E, P]``.
 
     Yields:
         ``(round, players [R, E, P])`` at the checkpoints and at the end.
@@ -77,8 +79,8 @@ def play(
         "ipo": costs,
         "separate": costs,
     }[settings.method]
-    weights = new_players(start.shape[0], len(objectives), start.shape[1:], dtype=start.dtype)
-    weights += start.unsqueeze(1)
+    weights = new_players(start.shape[0], len(objectives), start.shape[-1:], dtype=start.dtype)
+    weights += start if start.dim() == 3 else start.unsqueeze(1)
     move = _mover(weights, objectives, settings)
     wanted = {*checkpoints, settings.num_rounds}
     for number in range(settings.num_rounds + 1):
@@ -112,6 +114,24 @@ def residual(costs: Sequence[Cost], players: Tensor, bound: float | None = None)
     limit = torch.inf if bound is None else bound
     steps = wishes(costs, average(players)) / players.shape[1]
     return ((players + steps).clamp(-limit, limit) - players).abs().flatten(1).amax(1)
+
+
+def gap(costs: Sequence[Cost], players: Tensor, alone: Settings) -> Tensor:
+    """The Nash gap ``[R]``: every player goes down alone as ``alone`` says, bounds included.
+
+    It is a lower bound that is tight if ``alone`` has enough rounds to settle.
+    """
+    policy, num = average(players), players.shape[1]
+    now = torch.stack([cost(policy) for cost in costs], 1)
+    best = []
+    for d, cost in enumerate(costs):
+        others = policy - players[:, d] / num
+
+        def own(w: Tensor, cost: Cost = cost, others: Tensor = others) -> Tensor:
+            return cost(others + w / num)
+
+        best.append(own(last([own], players[:, d], alone)[:, 0]))
+    return nash_gap(now, torch.minimum(now, torch.stack(best, 1)))
 
 
 def vote(optima: Tensor, bound: float) -> Tensor:
@@ -171,6 +191,7 @@ def _check_start(costs: Sequence[Cost], start: Tensor) -> None:
         raise ValueError("costs: there is no domain, must be at least one")
     if not bool(torch.isfinite(start).all()):
         raise ValueError("start: holds NaN or infinite weights, must be finite")
+    policy = average(start) if start.dim() == 3 else start
     for d, cost in enumerate(costs):
-        if not bool(torch.isfinite(cost(start)).all()):
+        if not bool(torch.isfinite(cost(policy)).all()):
             raise ValueError(f"start: costs infinitely much in domain {d}, must be finite")
