@@ -157,32 +157,24 @@ def _mover(weights: Tensor, objectives: Sequence[Cost], settings: Settings) -> C
     limit = torch.inf if settings.bound is None else settings.bound
     players = split_players(weights)
     policy = average(weights)
-
-    def optimizer_of(leaf: Tensor) -> torch.optim.Optimizer:
-        return make_optimizer(settings.optimizer, [leaf], settings.learning_rate)
-
-    def step(optimizer: torch.optim.Optimizer, leaf: Tensor, objective: Callable) -> None:
-        descend(optimizer, objective, settings.max_gradient_norm)
-        leaf.detach().clamp_(-limit, limit)
-
-    if settings.order == "together":
-        # One leaf for all. Both optimisers act number by number, so each player has its own.
-        everybody = weights.detach().requires_grad_()
-        optimizer = optimizer_of(everybody)
-
-        def sum_of_costs() -> Tensor:
-            others = average(everybody.detach()).unsqueeze(1) - everybody.detach() / len(players)
-            seen = others + everybody / len(players)
-            return torch.stack([cost(seen[:, d]) for d, cost in enumerate(objectives)]).sum(0)
-
-        return lambda: step(optimizer, everybody, sum_of_costs)
-
-    optimizers = [optimizer_of(player) for player in players]
+    optimizers = [
+        make_optimizer(settings.optimizer, [player], settings.learning_rate) for player in players
+    ]
 
     def respond(d: int, policy_of_d: Callable[[], Tensor]) -> None:
         seen = (lambda: players[d]) if settings.method == "separate" else policy_of_d
-        step(optimizers[d], players[d], lambda: objectives[d](seen()))
+        descend(optimizers[d], lambda: objectives[d](seen()), settings.max_gradient_norm)
+        players[d].detach().clamp_(-limit, limit)
 
+    def all_at_once() -> None:
+        share = 1 / len(players)
+        others = [policy - share * player.detach() for player in players]
+        for d, player in enumerate(players):
+            respond(d, lambda d=d, player=player: others[d] + share * player)
+        policy.copy_(average(weights))
+
+    if settings.order == "together":
+        return all_at_once
     return lambda: best_response_round(players, policy, respond)
 
 

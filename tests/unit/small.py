@@ -65,3 +65,9 @@ def assert_close(actual: Tensor, expected: object, rtol: float = 1e-9) -> None:
     expected = torch.as_tensor(np.asarray(expected), dtype=actual.dtype)
     atol = rtol * float(expected.abs().max())
     torch.testing.assert_close(actual, expected, rtol=0, atol=atol)
+
+
+def assert_near(actual: Tensor, expected: object, atol: float) -> None:
+    """Equal up to an absolute difference: for what a game has come close to."""
+    expected = torch.as_tensor(expected, dtype=actual.dtype).broadcast_to(actual.shape)
+    torch.testing.assert_close(actual, expected, rtol=0, atol=atol)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from small import assert_close
+from small import assert_close, assert_near
 
 from ipo.game import average
 from ipo.scalar_control import (
@@ -15,7 +15,7 @@ from ipo.scalar_control import (
     unseen_cost,
 )
 from ipo.scalar_experiments import START, Cell, gains_of, problems, run_cell, standard
-from ipo.vector_game import Settings, last
+from ipo.vector_game import Settings, last, wishes
 
 
 def double(values) -> torch.Tensor:
@@ -63,7 +63,7 @@ def test_invariant_controller():
     k = invariant_gains()
     assert k.tolist() == pytest.approx([0.404, 0.0], abs=5e-4)
     betas = double([-1.0, -0.2, 0.3, 1.0])
-    assert_close(stationary_cost(k, betas), torch.full((4,), 2.224).double(), atol=5e-4)
+    assert_near(stationary_cost(k, betas), torch.full((4,), 2.224).double(), atol=5e-4)
     for move in ((0.01, 0.0), (-0.01, 0.0)):
         assert float(stationary_cost(k + double(move), double(0.0))) > 2.2239
 
@@ -83,7 +83,6 @@ TABLE = [
     ((1.0, -0.2), "ipo_bound5", (0.404, 0.000), 2.22, (2.22, 2.22, 2.22)),
     ((1.0, 0.5), "pooled", (0.086, 0.670), 1.73, (np.inf,) * 3),
     ((1.0, 0.5), "ipo_bound1", (0.006, 0.599), 1.84, (np.inf,) * 3),
-    ((1.0, 0.5), "ipo_bound5", (0.006, 0.599), 1.84, (np.inf,) * 3),
     ((1.0, -0.2, 0.9), "pooled", (0.345, 0.207), 2.10, (2.43, 2.99, 4.26)),
     ((1.0, -0.2, 0.9), "ipo_bound2", (0.074, 0.531), np.inf, (np.inf,) * 3),
     ((1.0, -0.2, 0.9), "ipo_bound0.5", (0.277, 0.167), 2.17, (2.65, 3.35, 4.90)),
@@ -95,7 +94,7 @@ TABLE = [
 @pytest.mark.parametrize(("betas", "label", "expected", "training", "elsewhere"), TABLE)
 def test_table_of_the_book(betas, label, expected, training, elsewhere):
     rule = standard(len(betas))[label]
-    rule = Settings(**(vars(rule) | {"num_rounds": 4000}))
+    rule = Settings(**(vars(rule) | {"num_rounds": 4000 if label == "ipo_bound5" else 2000}))
     gains = average(last(costs(double([betas])), double([START]), rule))[0]
     assert gains.tolist() == pytest.approx(expected, abs=6e-4)
     own = stationary_cost(gains, double(betas)).mean()
@@ -106,16 +105,20 @@ def test_table_of_the_book(betas, label, expected, training, elsewhere):
 
 @pytest.mark.parametrize("start", [(0.3, 0.1), (0.1, -0.2), (0.5, 0.3)])
 def test_bounded_players_find_the_invariant_controller_from_everywhere(start):
-    rule = Settings("ipo", learning_rate=0.2, num_rounds=4000, bound=2.0, max_gradient_norm=1.0)
+    rule = Settings("ipo", learning_rate=0.2, num_rounds=2000, bound=2.0, max_gradient_norm=1.0)
     players = last(costs(double([[1.0, -0.2]])), double([start]), rule)
-    assert_close(average(players)[0], invariant_gains(), atol=1e-6)
+    assert_near(average(players)[0], invariant_gains(), atol=1e-6)
 
 
-def test_an_odd_number_of_domains_elects_the_median():
-    rule = Settings("ipo", learning_rate=0.3, num_rounds=6000, bound=5.0, max_gradient_norm=1.0)
-    players = last(costs(double([[1.0, 0.2, -0.5]])), double([START]), rule)
-    alone = last(costs(double([[0.2]])), double([START]), Settings("pooled", num_rounds=6000))
-    assert_close(average(players), average(alone), atol=1e-4)
+def test_with_three_domains_each_gain_is_decided_by_another_one():
+    """The vote, gain by gain: nobody's own optimum comes out, the median domain's neither."""
+    betas = (1.0, 0.2, -0.5)
+    rule = Settings("ipo", learning_rate=0.3, num_rounds=2500, bound=2.0, max_gradient_norm=1.0)
+    players = last(costs(double([betas])), double([START]), rule)
+    contents = wishes(costs(double([betas])), average(players))[0].abs() < 1e-6
+    assert contents.tolist() == [[False, True], [True, False], [False, False]]
+    alone = last(costs(double([[0.2]])), double([START]), Settings("pooled", num_rounds=2000))
+    assert float((average(players) - average(alone)).norm()) > 1
 
 
 # --------------------------------------------------------------------------------- families

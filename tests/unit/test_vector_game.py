@@ -8,7 +8,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from small import assert_close
+from small import assert_close, assert_near
 
 from ipo.game import average
 from ipo.linear_game import Regression, correlated_noise, effect_of_target, irm_v1
@@ -71,13 +71,14 @@ def test_separate_players_find_their_own_optima():
     assert_close(players, problem.optima)
 
 
-def test_problems_do_not_interact():
+@pytest.mark.parametrize("order", ["in_turn", "together"])
+def test_problems_do_not_interact(order):
     rho = double([[0.8, -0.4], [0.9, 0.5], [-0.3, 0.1]])
-    rule = Settings("ipo", "adam", learning_rate=0.01, num_rounds=50)
+    rule = Settings("ipo", "adam", learning_rate=0.01, num_rounds=50, order=order)
     together = last(correlated_noise(rho).costs, torch.zeros(3, 2).double(), rule)
     for r in range(3):
         alone = last(correlated_noise(rho[r : r + 1]).costs, torch.zeros(1, 2).double(), rule)
-        assert torch.equal(together[r : r + 1], alone)
+        assert_close(together[r : r + 1], alone, rtol=1e-12)
 
 
 # --------------------------------------------------- plain steps are pooled gradient descent
@@ -108,13 +109,13 @@ def test_in_turn_the_difference_is_of_first_order():
 
 
 def test_without_bounds_players_drift_at_constant_speed_and_cancel():
-    """At the pooled optimum player d moves by eta (rho_d - mean) / ... in every round, for ever."""
+    """At the pooled optimum 0.2 player d moves by eta (rho_d - 0.2) in every round, for ever."""
     problem = correlated_noise(double([[0.8, -0.4]]))
-    rule = Settings("ipo", learning_rate=0.1, num_rounds=3000)
-    (_, early), (_, late) = play(problem.costs, double([[1.0, 0.0]]), rule, [2000])
+    rule = Settings("ipo", learning_rate=0.1, num_rounds=1500)
+    (_, early), (_, late) = play(problem.costs, double([[1.0, 0.0]]), rule, [500])
     drift = (late - early)[0, :, 1]
-    # dJ_d/dw_d = (p - rho_d), so 1000 rounds of 0.1 * 0.6, up to the first order of moving in turn
-    assert_close(drift.sum(), double(0.0), atol=1e-9)
+    # 1000 rounds of 0.1 * 0.6, up to the first order of moving in turn
+    assert_near(drift.sum(), double(0.0), atol=1e-9)
     assert float(drift[0]) == pytest.approx(60, rel=0.06)
     assert float(gap(problem.costs, late, Settings("pooled", learning_rate=1.0))) > 0.3
 
@@ -147,7 +148,7 @@ def test_bounded_players_end_at_the_vote(optima, bound, seed):
     rule = Settings("ipo", learning_rate=0.5 * len(optima), num_rounds=400, bound=bound)
     players = last(problem.costs, double([[0.0]]), rule)
     if float(residual(problem.costs, players, bound)) < 1e-9:  # else still on their way
-        assert_close(average(players), vote(problem.optima, bound), atol=1e-7)
+        assert_near(average(players), vote(problem.optima, bound), atol=1e-7)
     # Where they are on their way, the theorem's players are an equilibrium all the same.
     p = vote(problem.optima, bound)
     assert float(residual(problem.costs, equilibrium(problem, bound), bound)) < 1e-9
@@ -193,15 +194,15 @@ def test_in_turn_bounded_players_end_at_the_same_average_in_any_order(order):
     spurious = double([[0.9, -0.2, 0.4]])
     rule = Settings("ipo", learning_rate=1.0, num_rounds=2000, bound=2.0)
     players = last(correlated_noise(spurious[:, list(order)]).costs, double([[0.0, 0.0]]), rule)
-    assert_close(average(players), double([[1.0, 0.4]]), atol=1e-9)
+    assert_near(average(players), double([[1.0, 0.4]]), atol=1e-9)
 
 
 @pytest.mark.parametrize("spurious", [(1.0, -0.4), (0.3, -2.0), (1.0, 0.5, -0.3, -0.7)])
 def test_an_effect_is_ignored_where_signs_draw_even_though_features_are_correlated(spurious):
     problem = effect_of_target(double([spurious]), causal=0.7)
-    rule = Settings("ipo", learning_rate=0.3, num_rounds=8000, bound=3.0)
+    rule = Settings("ipo", learning_rate=1.0, num_rounds=1500, bound=1.5)
     players = last(problem.costs, double([[0.1, 0.2]]), rule)
-    assert_close(average(players), double([[0.7, 0.0]]), atol=1e-7)
+    assert_near(average(players), double([[0.7, 0.0]]), atol=1e-7)
     assert float(gap(problem.costs, players, replace(rule, method="pooled"))) < 1e-9
 
 
@@ -242,7 +243,7 @@ def test_costs_and_optima_against_samples():
         sampled = np.mean((y - w[0] * x_1 - w[1] * x_2) ** 2)
         assert float(problem.costs[d](double([w]))) == pytest.approx(sampled, rel=0.01)
         fitted = np.linalg.lstsq(np.stack([x_1, x_2], 1), y)[0]
-        assert_close(problem.optima[0, d], double(fitted), atol=0.01)
+        assert_near(problem.optima[0, d], double(fitted), atol=0.01)
 
 
 def test_invariant_predictor_has_the_same_slope_everywhere():
