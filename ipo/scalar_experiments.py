@@ -59,22 +59,24 @@ def standard(num_domains: int) -> dict[str, Settings]:
     round; its players have E times the learning rate, so that it is comparable with pooling.
     The bound on the gradients' norm acts only next to instability.
     """
-    plain = {"learning_rate": 0.05 * num_domains, "num_rounds": 8000, "max_gradient_norm": 1.0}
-    adam = {"optimizer": "adam", "learning_rate": 1e-3, "num_rounds": 10_000}
+    plain = {"learning_rate": 0.2 * num_domains, "num_rounds": 2000, "max_gradient_norm": 1.0}
+    adam = {"optimizer": "adam", "learning_rate": 2e-3, "num_rounds": 4000}
     bounded = {
         f"ipo_bound{bound:g}": Settings("ipo", bound=bound, **plain) for bound in (0.5, 1, 2, 5)
     }
     return bounded | {
-        "pooled": Settings("pooled", **(plain | {"learning_rate": 0.05})),
+        "pooled": Settings("pooled", **(plain | {"learning_rate": 0.1})),
         "pooled_adam": Settings("pooled", **adam),
         "ipo_plain": Settings(
-            "ipo", **(plain | {"learning_rate": 0.002 * num_domains, "num_rounds": 30_000})
+            "ipo", **(plain | {"learning_rate": 0.002 * num_domains, "num_rounds": 10_000})
         ),
-        "ipo_plain_large": Settings("ipo", **plain),
-        "ipo_plain_together": Settings("ipo", order="together", **plain),
+        "ipo_plain_large": Settings("ipo", **(plain | {"learning_rate": 0.05 * num_domains})),
+        "ipo_plain_together": Settings(
+            "ipo", order="together", **(plain | {"learning_rate": 0.05 * num_domains})
+        ),
         "ipo_adam": Settings("ipo", **adam),
         "ipo_adam_together": Settings("ipo", order="together", **adam),
-        "ipo_adam_large": Settings("ipo", **(adam | {"learning_rate": 1e-2})),
+        "ipo_adam_large": Settings("ipo", **(adam | {"learning_rate": 2e-2})),
         "ensemble_adam": Settings("ensemble", **adam),
         "separate_adam": Settings("separate", **adam),
     }

@@ -106,7 +106,7 @@ def wishes(costs: Sequence[Cost], policy: Tensor) -> Tensor:
 def residual(costs: Sequence[Cost], players: Tensor, bound: float | None = None) -> Tensor:
     """How far from an equilibrium, ``[R]``: the largest step that a player would still make.
 
-        max over d, i of | clip(w_d - grad_d J_d, -bound, bound) - w_d |,    grad_d = grad / E
+        max over d, i of abs(clip(w_d - grad_d J_d, -bound, bound) - w_d),    grad_d = grad / E
 
     It is zero where every player's first-order conditions hold, bounds included; for convex
     costs that is exactly at a Nash equilibrium.

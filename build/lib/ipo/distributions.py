@@ -1,0 +1,92 @@
+"""Distributions over actions, from the numbers that a network puts out for an observation.
+
+Each is described by ``parameters [..., P]`` that the players *average* (appendix of the paper):
+the scores of a categorical distribution, the means and standard deviations of a Gaussian one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+LOG_SQRT_TAU = 0.5 * math.log(2 * math.pi)
+
+
+class Distribution(Protocol):
+    """What training needs of a distribution over actions; R runs, each with its own generator."""
+
+    @staticmethod
+    def sample(parameters: Tensor, generators: Sequence[np.random.Generator]) -> Tensor:
+        """Actions for ``parameters [R, N, P]``."""
+
+    @staticmethod
+    def mode(parameters: Tensor) -> Tensor:
+        """The most likely actions."""
+
+    @staticmethod
+    def log_probability(parameters: Tensor, actions: Tensor) -> Tensor:
+        """log pi(a | o), ``[...]``; of a density where actions are continuous."""
+
+    @staticmethod
+    def entropy(parameters: Tensor) -> Tensor:
+        """H(pi( . | o)) in nats, ``[...]``."""
+
+
+class Categorical:
+    """A of a finite set; the parameters are its logits ``[..., A]``, an action is a number."""
+
+    @staticmethod
+    def sample(parameters: Tensor, generators: Sequence[np.random.Generator]) -> Tensor:
+        uniform = np.stack([generator.random(parameters.shape[1]) for generator in generators])
+        below = parameters.softmax(-1).cumsum(-1)[..., :-1]  # rounding must not lead too far
+        return (torch.tensor(uniform, dtype=below.dtype).unsqueeze(-1) > below).sum(-1)
+
+    @staticmethod
+    def mode(parameters: Tensor) -> Tensor:
+        return parameters.argmax(-1)
+
+    @staticmethod
+    def log_probability(parameters: Tensor, actions: Tensor) -> Tensor:
+        return parameters.log_softmax(-1).gather(-1, actions.unsqueeze(-1)).squeeze(-1)
+
+    @staticmethod
+    def entropy(parameters: Tensor) -> Tensor:
+        log_probabilities = parameters.log_softmax(-1)
+        return -(log_probabilities.exp() * log_probabilities).sum(-1)
+
+
+class Gaussian:
+    """Independent normal numbers; the parameters are A means, then A standard deviations.
+
+        log pi(a | o) = -sum_i [ (a_i - m_i)^2 / (2 s_i^2) + log s_i + log(2 pi) / 2 ]
+        H(pi( . | o)) =  sum_i [ 1 / 2 + log s_i + log(2 pi) / 2 ]
+
+    Actions are not clipped: a motor or an environment may do that, and the probability is that of
+    the action before.
+    """
+
+    @staticmethod
+    def sample(parameters: Tensor, generators: Sequence[np.random.Generator]) -> Tensor:
+        mean, deviation = parameters.chunk(2, -1)
+        noise = [generator.standard_normal(mean.shape[1:]) for generator in generators]
+        return mean + deviation * torch.tensor(np.stack(noise), dtype=mean.dtype)
+
+    @staticmethod
+    def mode(parameters: Tensor) -> Tensor:
+        return parameters.chunk(2, -1)[0]
+
+    @staticmethod
+    def log_probability(parameters: Tensor, actions: Tensor) -> Tensor:
+        mean, deviation = parameters.chunk(2, -1)
+        standard = (actions - mean) / deviation
+        return -(0.5 * standard.square() + deviation.log() + LOG_SQRT_TAU).sum(-1)
+
+    @staticmethod
+    def entropy(parameters: Tensor) -> Tensor:
+        deviation = parameters.chunk(2, -1)[1]
+        return (0.5 + deviation.log() + LOG_SQRT_TAU).sum(-1)

@@ -1,0 +1,259 @@
+"""The four methods of the paper's LQR tables, as one game with different players.
+
+Each method is a few lines that say who moves and what it wants. All of them train many runs
+at once: every tensor has a leading run axis R, and runs never influence each other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ipo.checks import check_choice, check_count, check_number
+from ipo.game import average, best_response_round, new_players, split_players
+from ipo.lqr import LQR, expected_cost, spectral_radius, split_domains, training_costs
+from ipo.optimizers import OPTIMIZERS, descend, make_optimizer
+
+METHODS = ("gradient_descent", "overparameterized", "ipo_fixed_phi", "ipo_variable_phi")
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How a method is trained. The defaults are the paper's, where it states them.
+
+    Attributes:
+        method: one of :data:`METHODS`.
+        optimizer: ``adam`` (the published runs), ``plain`` (the paper's text) or ``lbfgs``.
+        learning_rate: step size; the paper has 1e-3, and 5e-4 for IPO (Table 5).
+        num_iterations: steps of the single player, or rounds of all players.
+        weight_decay: decoupled, per unit of learning rate; the paper has none.
+        max_gradient_norm: bound on each gradient's norm, run by run; the paper has none.
+        num_hidden: rows of Phi, or width of the overparameterised controller.
+        phi_scale: standard deviation of the initial entries of Phi (not published).
+        gain_scale: the same for the controllers behind Phi (not published).
+    """
+
+    method: str
+    optimizer: str = "adam"
+    learning_rate: float = 1e-3
+    num_iterations: int = 5000
+    weight_decay: float = 0.0
+    max_gradient_norm: float | None = None
+    num_hidden: int = 200
+    phi_scale: float = 0.001
+    gain_scale: float = 0.001
+
+    def __post_init__(self) -> None:
+        check_choice("method", self.method, METHODS)
+        check_choice("optimizer", self.optimizer, OPTIMIZERS)
+        check_number("learning_rate", self.learning_rate, above=0)
+        check_count("num_iterations", self.num_iterations, minimum=0)
+        check_number("weight_decay", self.weight_decay, least=0)
+        if self.max_gradient_norm is not None:
+            check_number("max_gradient_norm", self.max_gradient_norm, above=0)
+        check_count("num_hidden", self.num_hidden)
+        check_number("phi_scale", self.phi_scale, least=0)
+        check_number("gain_scale", self.gain_scale, least=0)
+
+
+def published(method: str) -> Settings:
+    """The settings behind Tables 1 and 2; for Phi the reading that comes closest (see the book)."""
+    check_choice("method", method, METHODS)
+    if method == "ipo_fixed_phi":
+        return Settings(method, learning_rate=5e-4)
+    if method == "ipo_variable_phi":
+        return Settings(method, learning_rate=5e-4, phi_scale=0.03, gain_scale=0.0)
+    return Settings(method)
+
+
+@dataclass(frozen=True)
+class Learner:
+    """``iterate()`` lets everybody move once; ``gain()`` is the controller ``[R, n_u, n_o]``."""
+
+    iterate: Callable[[], None]
+    gain: Callable[[], Tensor]
+
+
+def gradient_descent(
+    problem: LQR, settings: Settings, start: Tensor, seeds: Sequence[int]
+) -> Learner:
+    """One player that owns all domains: gradient descent on the pooled cost of K."""
+    K = start.clone().requires_grad_()
+    step = _stepper(settings, K)
+    return Learner(
+        iterate=lambda: step(lambda: training_costs(K, problem).mean(1)),
+        gain=lambda: K.detach(),
+    )
+
+
+def overparameterized(
+    problem: LQR, settings: Settings, start: Tensor, seeds: Sequence[int]
+) -> Learner:
+    """The same player with a controller of two layers, ``K = K_2 K_1``."""
+    Phi, K = _random_layers(problem, settings, seeds)
+    step = _stepper(settings, Phi, K)
+    return Learner(
+        iterate=lambda: step(lambda: training_costs(K @ Phi, problem).mean(1)),
+        gain=lambda: (K @ Phi).detach(),
+    )
+
+
+def ipo_fixed_phi(problem: LQR, settings: Settings, start: Tensor, seeds: Sequence[int]) -> Learner:
+    """A player per domain, each with a whole controller; their average acts (Phi = identity)."""
+    play = _Players(problem, settings, start)
+    observations = [W.contiguous() for W in problem.W_train.unbind(1)]  # twice as fast
+    return Learner(
+        iterate=lambda: play.round(observations),
+        gain=lambda: play.policy,
+    )
+
+
+def ipo_variable_phi(
+    problem: LQR, settings: Settings, start: Tensor, seeds: Sequence[int]
+) -> Learner:
+    """Phi moves on the pooled cost of all domains, then every player on its own, above Phi."""
+    Phi, K = _random_layers(problem, settings, seeds)
+    play = _Players(problem, settings, K.detach())
+    step = _stepper(settings, Phi)
+
+    def iterate() -> None:
+        step(lambda: training_costs(play.policy @ Phi, problem).mean(1))
+        features = split_domains(Phi.detach() @ problem.seen, problem.num_domains)
+        play.round(features.unbind(1))
+
+    return Learner(iterate, gain=lambda: play.policy @ Phi.detach())
+
+
+class _Players:
+    """A player per domain, each with an optimiser of its own, and the ``policy`` that acts.
+
+    All players start at ``start``, and so does their average.
+    """
+
+    def __init__(self, problem: LQR, settings: Settings, start: Tensor) -> None:
+        self.problem = problem
+        players = new_players(
+            start.shape[0], problem.num_domains, start.shape[1:], dtype=start.dtype
+        )
+        players += start.unsqueeze(1)
+        self.players = split_players(players)
+        self.policy = average(players)
+        self.steps = [_stepper(settings, player) for player in self.players]
+
+    def round(self, features: Sequence[Tensor]) -> None:
+        """Best responses in order; player d's domain shows ``features[d] [R, n_h, n_x]``."""
+
+        def respond(d: int, policy_of_d: Callable[[], Tensor]) -> None:
+            self.steps[d](lambda: expected_cost(policy_of_d(), self.problem, features[d]))
+
+        best_response_round(self.players, self.policy, respond)
+
+
+LEARNERS = {
+    method.__name__: method
+    for method in (gradient_descent, overparameterized, ipo_fixed_phi, ipo_variable_phi)
+}
+
+
+def train(
+    problem: LQR,
+    settings: Settings,
+    seeds: Sequence[int],
+    start: Tensor | None = None,
+    checkpoints: Sequence[int] = (),
+) -> Iterator[tuple[int, Tensor]]:
+    """Train all runs of ``problem`` at once.
+
+    Args:
+        problem: R problems.
+        settings: the method and how it is trained.
+        seeds: R seeds, from which each run draws the random start of its Phi.
+        start: controllers ``[R, n_u, n_o]`` to start from; zero if none is given. Methods
+            with a Phi start from random layers instead.
+        checkpoints: iterations after which to report, besides the last.
+
+    Yields:
+        ``(iteration, gain [R, n_u, n_o])`` at the checkpoints and at the end.
+
+    Raises:
+        ValueError: seeds or start of the wrong number or shape, a start with NaN, a start
+            with an unstable closed loop, before anything is trained.
+    """
+    if len(seeds) != problem.num_runs:
+        raise ValueError(f"seeds = {list(seeds)}: must be one for each of {problem.num_runs} runs")
+    start = _checked_start(problem, settings, start)
+    learner = LEARNERS[settings.method]
+    if settings.optimizer == "lbfgs":  # its curvature model would mix the runs: one at a time
+        learners = [
+            learner(problem.run(r), settings, start[r : r + 1], [seed])
+            for r, seed in enumerate(seeds)
+        ]
+    else:
+        learners = [learner(problem, settings, start, seeds)]
+    _check_stable("start", torch.cat([learner.gain() for learner in learners]), problem)
+
+    wanted = {*checkpoints, settings.num_iterations}
+    for iteration in range(settings.num_iterations + 1):
+        if iteration in wanted:
+            yield iteration, torch.cat([learner.gain() for learner in learners]).clone()
+        if iteration < settings.num_iterations:
+            for learner in learners:
+                learner.iterate()
+
+
+def trained_gain(problem: LQR, settings: Settings, seeds: Sequence[int], **options) -> Tensor:
+    """The last controller ``[R, n_u, n_o]`` of :func:`train`, which takes the same options."""
+    *_, (_, gain) = train(problem, settings, seeds, **options)
+    return gain
+
+
+def _stepper(settings: Settings, *weights: Tensor) -> Callable[[Callable[[], Tensor]], None]:
+    """A function that lowers an objective by one step on ``weights``, with its own optimiser."""
+    optimizer = make_optimizer(
+        settings.optimizer, weights, settings.learning_rate, settings.weight_decay
+    )
+    return lambda objective: descend(optimizer, objective, settings.max_gradient_norm)
+
+
+def _random_layers(problem: LQR, settings: Settings, seeds: Sequence[int]) -> tuple[Tensor, Tensor]:
+    """Random ``Phi [R, n_h, n_o]`` and controller ``[R, n_u, n_h]``, a stream for each run."""
+    num_inputs, num_observations = problem.gain_shape
+
+    def draw(seed: int) -> tuple[np.ndarray, np.ndarray]:
+        generator = np.random.default_rng(np.random.SeedSequence(seed).spawn(1)[0])
+        return (
+            settings.phi_scale * generator.standard_normal((settings.num_hidden, num_observations)),
+            settings.gain_scale * generator.standard_normal((num_inputs, settings.num_hidden)),
+        )
+
+    layers = zip(*map(draw, seeds), strict=True)
+    Phi, K = (torch.tensor(np.stack(layer)).to(problem.A).requires_grad_() for layer in layers)
+    return Phi, K
+
+
+def _checked_start(problem: LQR, settings: Settings, start: Tensor | None) -> Tensor:
+    shape = (problem.num_runs, *problem.gain_shape)
+    if start is None:
+        return torch.zeros(shape, dtype=problem.A.dtype)
+    if settings.method in ("overparameterized", "ipo_variable_phi"):
+        raise ValueError(f"start: {settings.method} starts from random layers, not from a gain")
+    if tuple(start.shape) != shape:
+        raise ValueError(f"start: has shape {tuple(start.shape)}, must have {shape}")
+    if not bool(torch.isfinite(start).all()):
+        raise ValueError("start: holds NaN or infinite entries, must be finite")
+    return start.to(problem.A)
+
+
+def _check_stable(name: str, K: Tensor, problem: LQR) -> None:
+    unstable = torch.isinf(training_costs(K, problem)).nonzero()
+    if len(unstable):
+        r, d = unstable[0].tolist()
+        radius = float(spectral_radius(K, problem, problem.W_train[:, d])[r])
+        raise ValueError(
+            f"{name}: the closed loop of run {r} in training domain {d} has spectral radius "
+            f"{radius:.4f}, must be below 1 for the cost to be finite"
+        )

@@ -1,0 +1,71 @@
+"""The optimisers that a player can be given, all behind one call: :func:`descend`.
+
+``adam`` is what the paper's runs use, ``plain`` is the gradient descent of its text, and
+``lbfgs`` shows what a quasi-Newton method makes of the same costs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+
+from ipo.checks import check_choice, check_number
+
+OPTIMIZERS = ("adam", "plain", "lbfgs")
+
+
+def make_optimizer(
+    name: str, weights: Sequence[Tensor], learning_rate: float, weight_decay: float = 0.0
+) -> torch.optim.Optimizer:
+    """An optimiser for leaves ``[runs, ...]``.
+
+    Adam and plain steps act on each number or each run alone, so runs never mix. L-BFGS
+    builds one curvature model of all the numbers it is given: give it one run at a time.
+
+    Raises:
+        ValueError: an unknown name, a learning rate that is not positive, a negative decay.
+    """
+    check_choice("optimizer", name, OPTIMIZERS)
+    check_number("learning_rate", learning_rate, above=0)
+    check_number("weight_decay", weight_decay, least=0)
+    if name == "adam":  # decoupled decay (AdamW); with weight_decay = 0 it is Adam itself
+        return torch.optim.AdamW(weights, learning_rate, weight_decay=weight_decay, fused=True)
+    if name == "plain":
+        return torch.optim.SGD(weights, learning_rate, weight_decay=weight_decay)
+    return torch.optim.LBFGS(
+        weights, learning_rate, max_iter=1, max_eval=25, line_search_fn="strong_wolfe"
+    )
+
+
+def descend(
+    optimizer: torch.optim.Optimizer,
+    objective: Callable[[], Tensor],
+    max_gradient_norm: float | None = None,
+) -> None:
+    """One step down ``objective() -> [runs]``, for all runs at once.
+
+    Only the optimiser's own leaves are differentiated, so nobody else moves and no time is
+    spent on gradients that are not used. ``max_gradient_norm`` bounds the norm of each
+    leaf's gradient, run by run.
+    """
+    leaves = [leaf for group in optimizer.param_groups for leaf in group["params"]]
+
+    def closure() -> Tensor:
+        costs = objective()
+        # The runs do not interact: the gradient of their sum holds the gradient of each.
+        gradients = torch.autograd.grad(costs.sum(), leaves)
+        for leaf, gradient in zip(leaves, gradients, strict=True):
+            leaf.grad = _clip(gradient, max_gradient_norm)
+        return costs.detach().sum()
+
+    optimizer.step(closure)
+
+
+def _clip(gradient: Tensor, max_norm: float | None) -> Tensor:
+    if max_norm is None:
+        return gradient
+    dims = tuple(range(1, gradient.dim()))
+    norm = torch.linalg.vector_norm(gradient, dim=dims, keepdim=True)
+    return gradient * (max_norm / norm).clamp(max=1.0)

@@ -1,0 +1,223 @@
+"""Figures from tidy rows. The only module besides ``render`` that imports matplotlib."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+
+import matplotlib.colors
+import matplotlib.pyplot as plt
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from ipo.networks import Network
+from ipo.stats import bootstrap_interval
+
+# Colours of Okabe and Ito, which colour-blind readers can tell apart; markers for print.
+STYLES = {
+    "gradient_descent": ("gradient descent", "#D55E00", "o"),
+    "overparameterized": ("overparameterised", "#E69F00", "s"),
+    "ipo_fixed_phi": ("IPO, fixed Φ", "#0072B2", "^"),
+    "ipo_variable_phi": ("IPO, variable Φ", "#56B4E9", "v"),
+    "minimum_norm": ("minimum norm, closed form", "#009E73", "D"),
+    "oracle": ("oracle", "#000000", "_"),
+    "ppo": ("PPO", "#D55E00", "o"),
+    "ipo": ("IPO", "#0072B2", "^"),
+    "ensemble": ("ensemble, pooled data", "#E69F00", "s"),
+}
+
+# Where two methods are compared problem by problem; the same order in legends and tables.
+OUTCOMES = {
+    "IPO better": "#0072B2",
+    "tie": "#BBBBBB",
+    "IPO worse": "#D55E00",
+    "both unstable": "#333333",
+}
+
+STYLE = {
+    "figure.dpi": 110,
+    "savefig.dpi": 160,
+    "font.size": 10,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.alpha": 0.25,
+    "legend.frameon": False,
+    "figure.constrained_layout.use": True,
+    "figure.facecolor": "white",
+}
+
+
+def label(method: str) -> str:
+    """The name of a method in figures and tables."""
+    return STYLES[method][0] if method in STYLES else method.replace("_", " ")
+
+
+def metric_by(rows: pd.DataFrame, metric: str, x: str) -> pd.DataFrame:
+    """One row per method and ``x`` with ``mean, low, high``: a 95 % interval over runs."""
+
+    def summary(values: pd.Series) -> pd.Series:
+        low, high = bootstrap_interval(values.to_numpy(), np.random.default_rng(0))
+        return pd.Series({"mean": values.mean(), "low": low, "high": high})
+
+    chosen = rows[rows["metric"] == metric]
+    return chosen.groupby(["method", x])["value"].apply(summary).unstack().reset_index()
+
+
+def draw_metric(
+    ax: Axes, rows: pd.DataFrame, metric: str, x: str, methods: Sequence[str], **options
+) -> None:
+    """A line per method with its interval over runs as a band."""
+    summary = metric_by(rows, metric, x)
+    for method in methods:
+        line = summary[summary["method"] == method].sort_values(x)
+        name, color, marker = STYLES[method]
+        ax.plot(line[x], line["mean"], color=color, marker=marker, ms=5, label=name, **options)
+        ax.fill_between(line[x], line["low"], line["high"], color=color, alpha=0.2, lw=0)
+
+
+def draw_paper(ax: Axes, paper: pd.DataFrame, x: str, methods: Sequence[str]) -> None:
+    """The paper's means as hollow circles."""
+    for method in methods:
+        points = paper[paper["method"] == method]
+        ax.scatter(points[x], points["mean"], s=70, facecolors="none", edgecolors="0.35", zorder=3)
+    ax.scatter([], [], s=70, facecolors="none", edgecolors="0.35", label="paper")
+
+
+def draw_oracle(ax: Axes, cost: float) -> None:
+    ax.axhline(cost, color="black", lw=1, ls="--", label="oracle")
+
+
+def draw_runs(ax: Axes, values: dict[str, np.ndarray]) -> None:
+    """Every run of every method as a point, and the mean with its 95 % interval as a bar."""
+    rng = np.random.default_rng(0)
+    for column, runs in enumerate(values.values()):
+        ax.scatter(column + rng.uniform(-0.2, 0.2, len(runs)), runs, s=12, alpha=0.45, lw=0)
+        low, high = bootstrap_interval(runs, rng)
+        ax.plot([column + 0.3] * 2, [low, high], color="black", lw=2)
+        ax.plot(column + 0.3, runs.mean(), color="black", marker="o", ms=5)
+    ax.set_xticks(range(len(values)), [name.replace(", ", ",\n") for name in values])
+    ax.grid(axis="x", visible=False)
+
+
+def observations(panels: dict[str, np.ndarray], dim_state: int) -> Figure:
+    """What the agent sees over time in several domains: ``{title: [time, n_o]}``."""
+    fig, axes = plt.subplots(1, len(panels), figsize=(9, 4.2), sharey=True, squeeze=False)
+    limit = max(np.abs(panel).max() for panel in panels.values())
+    for ax, (title, panel) in zip(axes[0], panels.items(), strict=True):
+        picture = ax.imshow(
+            panel.T, aspect="auto", cmap="RdBu_r", vmin=-limit, vmax=limit, interpolation="nearest"
+        )
+        ax.axhline(dim_state - 0.5, color="black", lw=1.5)
+        ax.set(title=title, xlabel="time step")
+        ax.grid(False)
+    axes[0, 0].set_ylabel("observation $o_t$")
+    middles = {"$W_c s$: state": dim_state / 2}
+    middles["$W_d s$: distractor"] = (dim_state + panel.shape[1]) / 2
+    for text, middle in middles.items():
+        axes[0, 0].text(
+            0.98, middle, text, ha="right", va="center",
+            transform=axes[0, 0].get_yaxis_transform(),
+            bbox={"facecolor": "white", "alpha": 0.85, "edgecolor": "none", "pad": 2},
+        )  # fmt: skip
+    fig.colorbar(picture, ax=axes[0], label="value", shrink=0.8)
+    return fig
+
+
+def draw_two_players(
+    ax: Axes,
+    wishes: Sequence[float],
+    bound: float | None,
+    paths: Sequence[np.ndarray],
+    limit: float,
+) -> None:
+    """Two players with one weight each: vector field, best responses, bound and trajectories.
+
+    Player d wants the average ``(u + v) / 2`` at ``wishes[d]``; a path is ``[time, 2]``.
+    """
+    grid = np.linspace(-limit, limit, 13)
+    u, v = np.meshgrid(grid, grid)
+    push = [wish - (u + v) / 2 for wish in wishes]
+    length = np.hypot(*push) + 1e-9
+    ax.quiver(u, v, push[0] / length, push[1] / length, color="0.7", width=0.004, scale=26)
+    for wish, color, name in zip(wishes, ("#D55E00", "#0072B2"), ("1", "2"), strict=True):
+        ax.plot(grid, 2 * wish - grid, color=color, lw=1.5, label=f"best response of player {name}")
+    if bound is not None:
+        ax.add_patch(plt.Rectangle((-bound, -bound), 2 * bound, 2 * bound, fill=False, lw=1.5))
+    for path in paths:
+        ax.plot(*path.T, color="black", lw=1)
+        ax.plot(*path[0], color="black", marker=".", ms=6)
+        inside = np.abs(path[-1]).max() < limit
+        ax.plot(*path[-1], color="#009E73", marker="o", ms=8, zorder=3) if inside else None
+    ax.set(xlim=(-limit, limit), ylim=(-limit, limit), aspect="equal")
+    ax.grid(False)
+
+
+def draw_outcomes(ax: Axes, outcomes: np.ndarray, values: np.ndarray) -> None:
+    """A phase diagram: ``outcomes [rows, columns]`` are keys of :data:`OUTCOMES`."""
+    names = list(OUTCOMES)
+    numbers = np.vectorize(names.index)(outcomes)
+    half = (values[1] - values[0]) / 2
+    extent = (values[0] - half, values[-1] + half) * 2
+    colors = matplotlib.colors.ListedColormap(OUTCOMES.values())
+    ax.imshow(numbers, cmap=colors, vmin=-0.5, vmax=len(names) - 0.5, origin="lower", extent=extent)
+    ax.grid(False)
+
+
+def draw_network(ax: Axes, network: Network) -> None:
+    """The layers of an actor-critic as boxes, with their sizes, and what goes where."""
+    nodes, edges = network_graph(network)
+    for start, end in edges:
+        ax.annotate(
+            "", xy=nodes[end], xytext=nodes[start],
+            arrowprops={"arrowstyle": "->", "shrinkA": 34, "shrinkB": 34, "color": "0.3"},
+        )  # fmt: skip
+    for name, (x, y) in nodes.items():
+        color = "#D55E00" if "actor" in name else "#0072B2" if "critic" in name else "#009E73"
+        shape = network.shapes.get(name)
+        text = f"{name}\n{shape[0]} → {shape[1]}" if shape else name
+        ax.text(
+            x, y, text, ha="center", va="center", fontsize=9,
+            bbox={"boxstyle": "round,pad=0.4", "facecolor": "white", "edgecolor": color, "lw": 1.5},
+        )  # fmt: skip
+    columns = [x for x, _ in nodes.values()]
+    ax.set(xlim=(min(columns) - 0.6, max(columns) + 0.6), ylim=(-1.6, 1.6))
+    ax.axis("off")
+
+
+def network_graph(
+    network: Network,
+) -> tuple[dict[str, tuple[float, float]], list[tuple[str, str]]]:
+    """Nodes ``{layer: place}`` and edges of an actor-critic, from the names of its layers.
+
+    Layers that belong to neither actor nor critic come first, one after the other; the actor's
+    and the critic's layers follow, each in their own chain.
+    """
+    parts = {"actor": [], "critic": [], "trunk": []}
+    for name in network.shapes:
+        part = next((part for part in ("actor", "critic") if name.startswith(part)), "trunk")
+        parts[part].append(name)
+    trunk = ["observation", *parts["trunk"]]
+    nodes = {name: (float(x), 0.0) for x, name in enumerate(trunk)}
+    edges = list(itertools.pairwise(trunk))
+    for height, part, output in ((1.0, "actor", "scores"), (-1.0, "critic", "value")):
+        chain = [*parts[part], output]
+        nodes |= {name: (len(trunk) + float(x), height) for x, name in enumerate(chain)}
+        edges += itertools.pairwise([trunk[-1], *chain])
+    return nodes, edges
+
+
+def trajectories(energies: dict[str, np.ndarray], oracle: str) -> Figure:
+    """``|s_t|^2`` over time for several starts: ``{method: [starts, time]}``, median and range."""
+    fig, ax = plt.subplots(figsize=(7, 3.8))
+    for method, energy in energies.items():
+        name, color, _ = STYLES[method]
+        steps = np.arange(energy.shape[1])
+        low, middle, high = np.quantile(energy, [0.05, 0.5, 0.95], axis=0)
+        ax.plot(steps, middle, color=color, label=name, ls="--" if method == oracle else "-")
+        ax.fill_between(steps, low, high, color=color, alpha=0.15, lw=0)
+    ax.set(yscale="log", xlabel="time step", ylabel="$|s_t|^2$", ylim=(1e-6, None))
+    ax.legend()
+    return fig

@@ -1,0 +1,85 @@
+"""Statistics over runs: intervals, paired differences, probability of improvement.
+
+All methods see the same seeds, so comparisons are paired. Intervals are bootstrap intervals
+over runs; with few runs they are a little too narrow.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import scipy.stats
+
+from ipo.checks import check_number
+
+NUM_RESAMPLES = 10_000
+
+
+def iqm(values: Sequence[float], axis: int = -1) -> np.ndarray:
+    """Interquartile mean: the mean of the middle half of the runs."""
+    return scipy.stats.trim_mean(values, 0.25, axis=axis)
+
+
+def bootstrap_interval(
+    values: Sequence[float],
+    rng: np.random.Generator,
+    statistic: Callable = np.mean,
+    level: float = 0.95,
+) -> tuple[float, float]:
+    """Percentile bootstrap interval of a statistic of runs ``[num_runs]``.
+
+    Args:
+        statistic: takes an array and ``axis``, such as ``np.mean`` or :func:`iqm`.
+        level: nominal coverage, between 0 and 1.
+
+    Raises:
+        ValueError: fewer than two runs, values that are not finite, a level outside (0, 1).
+    """
+    values = _checked("values", values)
+    check_number("level", level, above=0)
+    if level >= 1:
+        raise ValueError(f"level = {level}: must be below 1")
+    if np.ptp(values) == 0:  # every resample is the same; scipy would warn and return NaN
+        return float(values[0]), float(values[0])
+    interval = scipy.stats.bootstrap(
+        (values,),
+        statistic,
+        confidence_level=level,
+        n_resamples=NUM_RESAMPLES,
+        axis=-1,
+        method="percentile",
+        rng=rng,
+    ).confidence_interval
+    return float(interval.low), float(interval.high)
+
+
+def paired_difference(
+    values: Sequence[float], baseline: Sequence[float], rng: np.random.Generator
+) -> tuple[float, float, float]:
+    """Mean of ``values - baseline`` run by run, with its 95 % bootstrap interval."""
+    values, baseline = _checked("values", values), _checked("baseline", baseline)
+    if len(values) != len(baseline):
+        raise ValueError(
+            f"baseline has {len(baseline)} runs, must have {len(values)}, one for each value"
+        )
+    difference = values - baseline
+    return float(difference.mean()), *bootstrap_interval(difference, rng)
+
+
+def probability_of_improvement(costs: Sequence[float], baseline: Sequence[float]) -> float:
+    """Probability that a run of the method costs less than a run of the baseline.
+
+    P(X < Y) + P(X = Y) / 2    over all pairs of runs (Mann-Whitney U / (n m))
+    """
+    costs, baseline = _checked("costs", costs), _checked("baseline", baseline)
+    return float(np.mean((costs[:, None] < baseline) + 0.5 * (costs[:, None] == baseline)))
+
+
+def _checked(name: str, values: Sequence[float]) -> np.ndarray:
+    array = np.asarray(values, dtype=float)
+    if array.ndim != 1 or len(array) < 2:
+        raise ValueError(f"{name}: has shape {array.shape}, must be a list of at least 2 runs")
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name} = {array.tolist()}: must be finite")
+    return array

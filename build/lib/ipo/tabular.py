@@ -1,0 +1,363 @@
+"""Small deterministic MiniGrid tasks as tables: fast rollouts, and returns without sampling error.
+
+MiniGrid stays the source of truth: :func:`tabulate` visits every state that can be reached and
+writes down what MiniGrid does there. Everything else is look-up in that table.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from filelock import FileLock
+from gymnasium import Env
+from minigrid.minigrid_env import MiniGridEnv
+from torch import Tensor
+from tqdm import tqdm
+
+from ipo.provenance import source_hash
+from ipo.rollouts import Step
+
+
+class NotTabularError(ValueError):
+    """An environment that a table cannot describe."""
+
+
+@dataclass(frozen=True)
+class TabularTask:
+    """A finite deterministic task: S states, A actions, K distinct observations, horizon T.
+
+    Attributes:
+        next_state: ``[S, A]``; where the episode ends, the state itself.
+        goal: ``[S, A]``, whether the action ends the episode with a reward.
+        done: ``[S, A]``, whether it ends the episode.
+        goal_reward: ``[T]``, the reward for reaching the goal in step 1, 2, ... T.
+        start: ``[S]``, probabilities of the states in which an episode begins.
+        observation: ``[S]``, the index of what the agent sees.
+        images: ``[K, height, width, channels]``, the distinct observations.
+        progress: ``[S]``, how many of the task's steps are done, as ``env.progress`` counts them;
+            zero where the environment does not.
+    """
+
+    next_state: np.ndarray
+    goal: np.ndarray
+    done: np.ndarray
+    goal_reward: np.ndarray
+    start: np.ndarray
+    observation: np.ndarray
+    images: np.ndarray
+    progress: np.ndarray
+
+    @property
+    def horizon(self) -> int:
+        return len(self.goal_reward)
+
+
+def tabulate(env: Env, max_states: int = 100_000) -> TabularTask:
+    """Breadth-first search over all states of a MiniGrid task, from every possible start.
+
+    Raises:
+        NotTabularError: an environment that is not of MiniGrid, one whose steps draw random
+            numbers or give different results when repeated, or one with more than ``max_states``
+            states.
+    """
+    env = env.unwrapped
+    if not isinstance(env, MiniGridEnv):
+        raise NotTabularError(f"env = {env}: must be a MiniGridEnv")
+    index: dict[Any, int] = {}
+    states: list[Any] = []
+    images: dict[bytes, int] = {}
+    observation: list[int] = []
+    progress: list[int] = []
+
+    def visit(image: np.ndarray) -> int:
+        """The index of the present state of ``env``, which is remembered if it is new."""
+        key = _key(env)
+        if key not in index:
+            if len(states) == max_states:
+                raise NotTabularError(f"max_states = {max_states}: the task has more states")
+            index[key] = len(states)
+            states.append(_snapshot(env))
+            observation.append(images.setdefault(image.tobytes(), len(images)))
+            progress.append(getattr(env, "progress", 0))
+        return index[key]
+
+    start: dict[int, float] = {}
+    for probability, image in _all_starts(env):
+        state = visit(image)
+        start[state] = start.get(state, 0.0) + probability
+    shape, dtype = image.shape, image.dtype
+
+    goal_reward = np.empty(env.max_steps)
+    for step in range(env.max_steps):
+        env.step_count = step + 1
+        goal_reward[step] = env._reward()
+
+    rows: list[list[tuple[int, bool, bool]]] = []
+    with tqdm(desc="tabulating", unit="state", leave=False) as bar:
+        while len(rows) < len(states):
+            state = len(rows)
+            rows.append([_step(env, states, state, a, visit) for a in range(env.action_space.n)])
+            bar.update()
+    table = np.array(rows)
+    return TabularTask(
+        next_state=table[..., 0].astype(np.int32),
+        goal=table[..., 1].astype(bool),
+        done=table[..., 2].astype(bool),
+        goal_reward=goal_reward,
+        start=np.array([start.get(state, 0.0) for state in range(len(states))]),
+        observation=np.array(observation, dtype=np.int32),
+        images=np.stack([np.frombuffer(i, dtype).reshape(shape) for i in images]),
+        progress=np.array(progress),
+    )
+
+
+def load_or_tabulate(make_env: Callable[..., Env], folder: str | Path, **options) -> TabularTask:
+    """:func:`tabulate` ``make_env(**options)``, or the same table from a file made before.
+
+    The name of the file holds a hash of all that decides its content.
+    """
+    module = make_env.__module__.rpartition(".")[2]
+    origin = [make_env.__qualname__, options, version("minigrid"), source_hash(["tabular", module])]
+    digest = hashlib.sha256(json.dumps(origin, sort_keys=True).encode()).hexdigest()[:16]
+    path = Path(folder) / f"{digest}.npz"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with FileLock(path.with_suffix(".lock")):  # others that want the same table wait for it
+        if not path.exists():
+            partial = path.with_suffix(".partial.npz")
+            np.savez_compressed(partial, **vars(tabulate(make_env(**options))))
+            partial.replace(path)
+    with np.load(path) as arrays:
+        return TabularTask(**{field.name: arrays[field.name] for field in fields(TabularTask)})
+
+
+class TabularDomains:
+    """Several tabulated domains of one task as one table, to be trained in.
+
+    Attributes:
+        images: the distinct observations of all domains, ``[K, height, width, channels]``.
+        observation_of: for each domain, the index in ``images`` of its own observations.
+    """
+
+    def __init__(self, tasks: Sequence[TabularTask]) -> None:
+        everything = np.concatenate([task.images for task in tasks])
+        self.images, index = np.unique(everything, axis=0, return_inverse=True)
+        self.observation_of = np.split(index, np.cumsum([len(task.images) for task in tasks])[:-1])
+        first = np.cumsum([0] + [len(task.start) for task in tasks])
+        self.next_state = np.concatenate(
+            [task.next_state + offset for task, offset in zip(tasks, first, strict=False)]
+        )
+        self.goal = np.concatenate([task.goal for task in tasks])
+        self.done = np.concatenate([task.done for task in tasks])
+        seen = [own[t.observation] for own, t in zip(self.observation_of, tasks, strict=True)]
+        self.observation = torch.tensor(np.concatenate(seen))
+        self.goal_reward = tasks[0].goal_reward
+        # Starts of domain d as cumulative probabilities over all states, from d to d + 1.
+        self.starts = np.cumsum(np.concatenate([task.start for task in tasks]))
+
+    def __call__(
+        self,
+        domains: Sequence[int],
+        num_copies: Sequence[int],
+        generators: Sequence[np.random.Generator],
+    ) -> TabularEnvironments:
+        """``num_copies`` of each of ``domains``, for one run per generator."""
+        return TabularEnvironments(self, np.repeat(domains, num_copies), generators)
+
+
+class TabularEnvironments:
+    """``[R, N]`` copies that begin anew when they end: ``rollouts.Environments``."""
+
+    def __init__(
+        self,
+        table: TabularDomains,
+        domains: np.ndarray,
+        generators: Sequence[np.random.Generator],
+    ) -> None:
+        self.table, self.domains, self.generators = table, domains, generators
+
+    def reset(self) -> Tensor:
+        """Begin all episodes; returns indices of observations ``[R, N]``."""
+        self.state = self._starts()
+        self.step_count = np.zeros_like(self.state)
+        return self.table.observation[self.state]
+
+    def step(self, actions: Tensor) -> Step:
+        table, action = self.table, actions.numpy()
+        goal, done = table.goal[self.state, action], table.done[self.state, action]
+        reward = goal * table.goal_reward[self.step_count]
+        self.state = table.next_state[self.state, action]
+        self.step_count += 1
+        truncated = ~done & (self.step_count == len(table.goal_reward))
+        last_observation = table.observation[self.state]
+        ended = done | truncated
+        self.state = np.where(ended, self._starts(), self.state)
+        self.step_count[ended] = 0
+        return Step(
+            table.observation[self.state],
+            torch.tensor(reward, dtype=torch.float32),
+            torch.tensor(done),
+            torch.tensor(truncated),
+            last_observation,
+        )
+
+    def _starts(self) -> np.ndarray:
+        uniform = np.stack([generator.random(len(self.domains)) for generator in self.generators])
+        return np.searchsorted(self.table.starts, self.domains + uniform, side="right")
+
+
+def expected_return(task: TabularTask, policy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Expected return and success probability of policies, by dynamic programming.
+
+        V_t(s) = sum_a pi(a | s) [ r_t 1{goal} + 1{not done} V_(t+1)(s') ],    V_T = 0
+
+    Args:
+        policy: probabilities ``[P, K, A]``, by observation.
+
+    Returns:
+        returns ``[P]`` and success probabilities ``[P]``, over the starts of the task.
+    """
+    chosen = policy[:, task.observation].transpose(2, 1, 0)  # [A, S, P]
+    scores = (chosen * task.goal.T[..., None]).sum(0)
+    goes_on = np.tile(chosen * ~task.done.T[..., None], 2)  # for return and success side by side
+    value = np.zeros_like(goes_on[0])
+    for reward in task.goal_reward[::-1]:
+        earlier = np.concatenate([reward * scores, scores], axis=1)
+        for probability, next_state in zip(goes_on, task.next_state.T, strict=True):
+            earlier += probability * value[next_state]
+        value = earlier
+    returns, success = np.split(task.start @ value, 2)
+    return returns, success
+
+
+def reach(task: TabularTask, policy: np.ndarray, states: np.ndarray) -> np.ndarray:
+    """Probability ``[P]`` that policies ``[P, K, A]`` ever come to one of ``states [S]``.
+
+    Within the horizon; ``states`` are true where the search ends.
+    """
+    entered = states[task.next_state] & ~task.done
+    goal = replace(
+        task,
+        goal=entered,
+        done=task.done | entered,
+        start=np.where(states, 0.0, task.start),
+    )
+    return expected_return(goal, policy)[1] + float(task.start @ states)
+
+
+def optimal_policy(task: TabularTask) -> tuple[np.ndarray, float]:
+    """Best action ``[T, S]`` for every step and state, and its expected return.
+
+    Value iteration over the finite horizon. It sees the state, not only the observation.
+    """
+    value = np.zeros(len(task.start))
+    actions = np.empty((task.horizon, len(value)), dtype=int)
+    for t in reversed(range(task.horizon)):
+        q = task.goal * task.goal_reward[t] + ~task.done * value[task.next_state]
+        actions[t], value = q.argmax(1), q.max(1)
+    return actions, float(task.start @ value)
+
+
+class _Choices:
+    """Stands in for the generator that MiniGrid draws a layout from, and takes every branch.
+
+    ``integers`` replays a script of choices; what lies beyond its end is choice 0.
+    """
+
+    def __init__(self) -> None:
+        self.script: list[int] = []
+        self.options: list[int] = []
+
+    def integers(self, low: int, high: int) -> int:
+        self.options.append(high - low)
+        if len(self.script) < len(self.options):
+            self.script.append(0)
+        return low + self.script[len(self.options) - 1]
+
+    def next_branch(self) -> bool:
+        """Go to the next script; false after the last one."""
+        while self.script and self.script[-1] + 1 == self.options[len(self.script) - 1]:
+            self.script.pop()
+        self.options = []
+        if self.script:
+            self.script[-1] += 1
+        return bool(self.script)
+
+
+def _all_starts(env: Env):
+    """Every layout that ``reset`` can draw: its probability and the first image."""
+    choices, own_generator = _Choices(), env.np_random
+
+    def place(obj, top=None, size=None, reject_fn=None, max_tries=None):
+        """MiniGrid tries cells until one is free; that is a uniform choice of the free ones."""
+        left, up = (max(corner, 0) for corner in (top or (0, 0)))
+        wide, high = size or (env.grid.width, env.grid.height)
+        free = [
+            (x, y)
+            for x in range(left, min(left + wide, env.grid.width))
+            for y in range(up, min(up + high, env.grid.height))
+            if env.grid.get(x, y) is None
+            and (x, y) != tuple(env.agent_pos)
+            and not (reject_fn and reject_fn(env, (x, y)))
+        ]
+        position = free[choices.integers(0, len(free))]
+        if obj is not None:
+            env.put_obj(obj, *position)
+        return position
+
+    env.place_obj = place
+    try:
+        while True:
+            env.np_random = choices
+            observation, _ = env.reset()
+            yield 1 / float(np.prod(choices.options)), observation["image"]
+            if not choices.next_branch():
+                return
+    finally:
+        del env.place_obj
+        env.np_random = own_generator
+
+
+def _key(env: Env) -> Any:
+    """What tells one state from another; MiniGrid's own hash leaves out what is carried."""
+    carried = env.carrying.encode() if env.carrying else None
+    return tuple(map(int, env.agent_pos)), env.agent_dir, carried, env.grid.encode().tobytes()
+
+
+def _snapshot(env: Env) -> Any:
+    things = {id(thing): thing for thing in [*env.grid.grid, env.carrying] if thing is not None}
+    contents = [(thing, dict(vars(thing))) for thing in things.values()]
+    return env.grid, list(env.grid.grid), contents, env.agent_pos, env.agent_dir, env.carrying
+
+
+def _restore(env: Env, snapshot: Any) -> None:
+    env.grid, cells, contents, env.agent_pos, env.agent_dir, env.carrying = snapshot
+    env.grid.grid = list(cells)
+    for thing, content in contents:
+        vars(thing).update(content)
+
+
+def _step(
+    env: Env, states: list[Any], state: int, action: int, visit: Callable[[np.ndarray], int]
+) -> tuple[int, bool, bool]:
+    """Next state, whether the goal was reached, whether the episode ended."""
+    outcomes = []
+    for _ in range(2):
+        _restore(env, states[state])
+        env.step_count = 0
+        before = env.np_random.bit_generator.state
+        observation, reward, terminated, _, _ = env.step(action)
+        drew = env.np_random.bit_generator.state != before
+        outcomes.append((_key(env), reward, terminated))
+    if drew or outcomes[0] != outcomes[1]:
+        raise NotTabularError(
+            f"env = {env}: must be deterministic, but action {action} has random effects"
+        )
+    return state if terminated else visit(observation["image"]), reward > 0, terminated
