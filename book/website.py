@@ -41,6 +41,8 @@ def stage(root: Path, source: Path, notebooks: list[Notebook], profile: str) -> 
         script.unlink()
     for name in ("_config.yml", "_toc.yml", "environment.txt"):
         shutil.copy(root / name, source)
+    # What pages show of the code is included from these files (literalinclude), not copied.
+    shutil.copytree(root / "ipo", source / "_code" / "ipo", ignore=ignored)
     for notebook in notebooks:
         nbformat.write(notebook.read_executed(), source / f"{notebook.name}.ipynb")
     (source / "run_times.md").write_text(run_times_page(notebooks, profile), encoding="utf-8")

@@ -27,7 +27,8 @@ class DenseNetwork(Network):
     Args:
         num_observations: length of an observation.
         num_actions: A, of how many to choose or of how many numbers an action consists.
-        distribution: :class:`Categorical` or :class:`Gaussian`.
+        distribution: :class:`ipo.distributions.Categorical` or
+            :class:`ipo.distributions.Gaussian`.
         hidden: units of each hidden layer.
     """
 
@@ -129,4 +130,5 @@ def _orthogonal(shape: tuple[int, int], generator: np.random.Generator) -> np.nd
     tall = generator.standard_normal((max(shape), min(shape)))
     Q, R = np.linalg.qr(tall)
     Q *= np.sign(np.diag(R))
-    return Q if shape[0] >= shape[1] else Q.T
+    # Contiguous: the fused Adam pairs weights and gradients by their place in memory.
+    return np.ascontiguousarray(Q if shape[0] >= shape[1] else Q.T)

@@ -75,7 +75,7 @@ class Network:
 
 
 class GridNetwork(Network):
-    """The actor-critic of the published runs for MiniGrid's 7x7 view (appendix, Fig. 6).
+    """The actor-critic of the published runs for MiniGrid's 7x7 view (appendix, Fig. 4).
 
     Three 2x2 convolutions (16, 32, 64 channels) with ReLU, max-pooling after the first; then an
     actor and a critic, each with one hidden layer of 64 tanh units.

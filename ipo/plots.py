@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Collection, Mapping, Sequence
 
+import matplotlib.colors
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from ipo.networks import Network
 from ipo.scm import SCM
 from ipo.stats import bootstrap_interval
 
@@ -30,6 +33,14 @@ STYLES = {
     "vrex": ("V-REx", "#E69F00", "s"),
     "irm_game_fixed_phi": ("IRM-Games, fixed Φ", "#0072B2", "^"),
     "irm_game_variable_phi": ("IRM-Games, variable Φ", "#56B4E9", "v"),
+}
+
+# Where two methods are compared problem by problem; the same order in legends and tables.
+OUTCOMES = {
+    "IPO better": "#0072B2",
+    "tie": "#BBBBBB",
+    "IPO worse": "#D55E00",
+    "both unstable": "#333333",
 }
 
 STYLE = {
@@ -125,6 +136,89 @@ def observations(panels: dict[str, np.ndarray], dim_state: int) -> Figure:
         )  # fmt: skip
     fig.colorbar(picture, ax=axes[0], label="value", shrink=0.8)
     return fig
+
+
+def draw_two_players(
+    ax: Axes,
+    wishes: Sequence[float],
+    bound: float | None,
+    paths: Sequence[np.ndarray],
+    limit: float,
+) -> None:
+    """Two players with one weight each: vector field, best responses, bound and trajectories.
+
+    Player d wants the average ``(u + v) / 2`` at ``wishes[d]``; a path is ``[time, 2]``.
+    """
+    grid = np.linspace(-limit, limit, 13)
+    u, v = np.meshgrid(grid, grid)
+    push = [wish - (u + v) / 2 for wish in wishes]
+    length = np.hypot(*push) + 1e-9
+    ax.quiver(u, v, push[0] / length, push[1] / length, color="0.7", width=0.004, scale=26)
+    for wish, color, name in zip(wishes, ("#D55E00", "#0072B2"), ("1", "2"), strict=True):
+        ax.plot(grid, 2 * wish - grid, color=color, lw=1.5, label=f"best response of player {name}")
+    if bound is not None:
+        ax.add_patch(plt.Rectangle((-bound, -bound), 2 * bound, 2 * bound, fill=False, lw=1.5))
+    for path in paths:
+        ax.plot(*path.T, color="black", lw=1)
+        ax.plot(*path[0], color="black", marker=".", ms=6)
+        inside = np.abs(path[-1]).max() < limit
+        ax.plot(*path[-1], color="#009E73", marker="o", ms=8, zorder=3) if inside else None
+    ax.set(xlim=(-limit, limit), ylim=(-limit, limit), aspect="equal")
+    ax.grid(False)
+
+
+def draw_outcomes(ax: Axes, outcomes: np.ndarray, values: np.ndarray) -> None:
+    """A phase diagram: ``outcomes [rows, columns]`` are keys of :data:`OUTCOMES`."""
+    names = list(OUTCOMES)
+    numbers = np.vectorize(names.index)(outcomes)
+    half = (values[1] - values[0]) / 2
+    extent = (values[0] - half, values[-1] + half) * 2
+    colors = matplotlib.colors.ListedColormap(OUTCOMES.values())
+    ax.imshow(numbers, cmap=colors, vmin=-0.5, vmax=len(names) - 0.5, origin="lower", extent=extent)
+    ax.grid(False)
+
+
+def draw_network(ax: Axes, network: Network) -> None:
+    """The layers of an actor-critic as boxes, with their sizes, and what goes where."""
+    nodes, edges = network_graph(network)
+    for start, end in edges:
+        ax.annotate(
+            "", xy=nodes[end], xytext=nodes[start],
+            arrowprops={"arrowstyle": "->", "shrinkA": 34, "shrinkB": 34, "color": "0.3"},
+        )  # fmt: skip
+    for name, (x, y) in nodes.items():
+        color = "#D55E00" if "actor" in name else "#0072B2" if "critic" in name else "#009E73"
+        shape = network.shapes.get(name)
+        text = f"{name}\n{shape[0]} → {shape[1]}" if shape else name
+        ax.text(
+            x, y, text, ha="center", va="center", fontsize=9,
+            bbox={"boxstyle": "round,pad=0.4", "facecolor": "white", "edgecolor": color, "lw": 1.5},
+        )  # fmt: skip
+    columns = [x for x, _ in nodes.values()]
+    ax.set(xlim=(min(columns) - 0.6, max(columns) + 0.6), ylim=(-1.6, 1.6))
+    ax.axis("off")
+
+
+def network_graph(
+    network: Network,
+) -> tuple[dict[str, tuple[float, float]], list[tuple[str, str]]]:
+    """Nodes ``{layer: place}`` and edges of an actor-critic, from the names of its layers.
+
+    Layers that belong to neither actor nor critic come first, one after the other; the actor's
+    and the critic's layers follow, each in their own chain.
+    """
+    parts = {"actor": [], "critic": [], "trunk": []}
+    for name in network.shapes:
+        part = next((part for part in ("actor", "critic") if name.startswith(part)), "trunk")
+        parts[part].append(name)
+    trunk = ["observation", *parts["trunk"]]
+    nodes = {name: (float(x), 0.0) for x, name in enumerate(trunk)}
+    edges = list(itertools.pairwise(trunk))
+    for height, part, output in ((1.0, "actor", "scores"), (-1.0, "critic", "value")):
+        chain = [*parts[part], output]
+        nodes |= {name: (len(trunk) + float(x), height) for x, name in enumerate(chain)}
+        edges += itertools.pairwise([trunk[-1], *chain])
+    return nodes, edges
 
 
 def trajectories(energies: dict[str, np.ndarray], oracle: str) -> Figure:

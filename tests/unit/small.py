@@ -100,3 +100,9 @@ def plain_network(weights: Weights, run: int = 0) -> ActorCritic:
             layer.weight.copy_(matrix)
             layer.bias.copy_(weights[f"{name}.bias"][run])
     return network
+
+
+def assert_near(actual: Tensor, expected: object, atol: float) -> None:
+    """Equal up to an absolute difference: for what a game has come close to."""
+    expected = torch.as_tensor(expected, dtype=actual.dtype).broadcast_to(actual.shape)
+    torch.testing.assert_close(actual, expected, rtol=0, atol=atol)

@@ -1,0 +1,124 @@
+"""What the players of a game between networks do while they are trained on coloured keys."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import torch
+from torch import Tensor
+
+from ipo.keys_experiments import Cell, Keys, encode
+from ipo.networks import OnTable, Weights
+from ipo.ppo import Training
+from ipo.tabular import TabularDomains, expected_return, optimal_policy
+
+MODULES = ("player_experiments",)
+
+
+def run_players(
+    cell: Cell,
+    seeds: list[int],
+    tables: str | Path,
+    checkpoints: Sequence[int] = (),
+    num_alone: int = 5,
+) -> pd.DataFrame:
+    """Train on coloured keys and look at the players: rows with a column ``update``.
+
+    After every update: how far the first and the last player are apart in their weights, how far
+    the first is from its start, and whether what the two have learnt points in the same direction
+    (the correlation of the changes of their scores since the start, over all observations and
+    actions of the training domains).
+
+    At the checkpoints also what each player gains in its own domain when it goes on alone for
+    ``num_alone`` updates while the others stand still. The best of them is a lower bound on the
+    Nash gap. An upper bound is what is missing to the optimal return in the worst domain.
+    """
+    task = Keys(tables, cell.color_encoding, cell.size)
+    domains = TabularDomains([task.tasks[color] for color in cell.train_colors])
+    network = OnTable(task.network, encode(domains.images, cell.color_encoding))
+    training = Training(
+        network, task.network.start, domains, len(cell.train_colors), cell.settings, seeds
+    )
+    start = copy.deepcopy(training.players)
+    scores_at_start = [_scores(task, player, cell.train_colors) for player in start]
+    best = [optimal_policy(task.tasks[color])[1] for color in cell.train_colors]
+    parts = []
+    for update in range(cell.settings.num_updates + 1):
+        if update:
+            training.update()
+        returns = _returns(task, training.players, cell.train_colors)
+        metrics = {
+            ("all", "distance_players"): _distance(training.players[0], training.players[-1]),
+            ("all", "distance_start"): _distance(training.players[0], start[0]),
+            ("train", "gap_upper"): np.max([b - r for b, r in zip(best, returns, strict=True)], 0),
+        }
+        metrics |= {
+            (color, "return_exact"): own
+            for color, own in zip(cell.train_colors, returns, strict=True)
+        }
+        if update:
+            moves = [
+                _scores(task, player, cell.train_colors) - before
+                for player, before in zip(training.players, scores_at_start, strict=True)
+            ]
+            metrics["all", "move_correlation"] = _correlation(moves[0], moves[-1])
+        if update in checkpoints:
+            gains = [
+                _returns(task, _alone(training, d, num_alone), cell.train_colors)[d] - returns[d]
+                for d in range(len(training.players))
+            ]
+            metrics["train", "gap_lower"] = np.maximum(np.max(gains, 0), 0)
+        rows = _rows(cell, seeds, metrics)
+        rows.insert(len(cell.columns), "update", update)
+        parts.append(rows)
+    return pd.concat(parts, ignore_index=True)
+
+
+def _alone(training: Training, d: int, num_updates: int) -> list[Weights]:
+    """The players after player d has gone on for some updates while the others stood still."""
+    training = copy.deepcopy(training)
+    for e, optimizer in enumerate(training.optimizers):
+        if e != d:
+            optimizer.param_groups[0]["lr"] = 0.0
+    for _ in range(num_updates):
+        training.update()
+    return training.players
+
+
+def _scores(task: Keys, player: Weights, colors: Sequence[str]) -> Tensor:
+    """What a player alone says ``[R, observations, A]``, up to what the softmax ignores."""
+    scores = torch.cat([task.logits([player], color) for color in colors], dim=1)
+    return scores - scores.mean(-1, keepdim=True)
+
+
+def _correlation(one: Tensor, other: Tensor) -> Tensor:
+    """Of all numbers of a run, ``[R]``."""
+    one, other = one.flatten(1), other.flatten(1)
+    return torch.cosine_similarity(one - one.mean(1, True), other - other.mean(1, True), dim=1)
+
+
+def _returns(task: Keys, players: Sequence[Weights], colors: Sequence[str]) -> list[np.ndarray]:
+    """Exact return ``[R]`` of the players' average in each colour."""
+    return [
+        expected_return(task.tasks[color], task.logits(players, color).softmax(-1).numpy())[0]
+        for color in colors
+    ]
+
+
+@torch.no_grad()
+def _distance(one: Weights, other: Weights) -> Tensor:
+    """Euclidean distance ``[R]`` over all weights."""
+    squares = [(one[name] - other[name]).flatten(1).square().sum(1) for name in one]
+    return torch.stack(squares).sum(0).sqrt()
+
+
+def _rows(cell: Cell, seeds: Sequence[int], metrics: dict[tuple[str, str], Tensor]) -> pd.DataFrame:
+    return pd.DataFrame(
+        {**cell.columns, "run": seed, "domain": domain, "metric": metric, "value": float(value)}
+        for (domain, metric), values in metrics.items()
+        for seed, value in zip(seeds, values, strict=True)
+    )
