@@ -65,7 +65,7 @@ def standard(num_domains: int) -> dict[str, Settings]:
         f"ipo_bound{bound:g}": Settings("ipo", bound=bound, **plain) for bound in (0.5, 1, 2, 5)
     }
     return bounded | {
-        "pooled": Settings("pooled", **(plain | {"learning_rate": 0.1})),
+        "pooled": Settings("pooled", **(plain | {"learning_rate": 0.05})),
         "pooled_adam": Settings("pooled", **adam),
         "ipo_plain": Settings(
             "ipo", **(plain | {"learning_rate": 0.002 * num_domains, "num_rounds": 10_000})

@@ -74,7 +74,9 @@
 
   const style = document.createElement("style");
   style.textContent = `
-    #regression-game { max-width: 30rem; margin: 1rem auto; }
+    /* In dark mode the theme puts outputs on a light card; this one has the page's own colours. */
+    .cell_output .text_html:has(#regression-game) { background: transparent !important; }
+    #regression-game { max-width: 30rem; margin: 1rem auto; color: var(--pst-color-text-base, #222); }
     #regression-game svg { width: 100%; height: auto; color: var(--pst-color-text-base, #222); }
     #regression-game text { fill: currentColor; font-size: 15px; }
     #regression-game .frame { fill: none; stroke: currentColor; opacity: 0.4; }
