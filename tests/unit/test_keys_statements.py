@@ -87,3 +87,8 @@ def test_the_most_likely_actions_fail_on_grey_and_the_door_is_where(rows, method
     )
     assert key > 0.99
     assert key - door > door - goal
+
+
+def test_at_equal_learning_rates_ipo_is_behind(rows):
+    for ipo, ppo in (("ipo", "ppo_lr5e-4"), ("ipo_lr1e-3", "ppo")):
+        assert runs(rows, ipo).mean() < runs(rows, ppo).mean()
