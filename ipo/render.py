@@ -71,8 +71,8 @@ def video(frames: Sequence[np.ndarray], caption: str, fps: int = 4) -> str:
     poster = base64.b64encode(picture.getvalue()).decode()
     text = html.escape(caption)
     return (
-        f'<figure class="film"><video controls loop muted playsinline aria-label="{text}" '
+        f'<div class="film"><video controls loop muted playsinline aria-label="{text}" '
         f'width="100%" poster="data:image/png;base64,{poster}">'
         f'<source type="video/mp4" src="data:video/mp4;base64,{film}"></video>'
-        f"<figcaption>{text}</figcaption></figure>"
+        f"<p>{text}</p></div>"
     )
