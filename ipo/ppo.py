@@ -216,8 +216,12 @@ class Training:
             [np.random.default_rng(stream[i]) for stream in streams] for i in range(3)
         )
         self.network, self.settings = network, settings
-        self.players = [start(self.draws) for _ in owned]
-        leaves = [[w.requires_grad_() for w in player.values()] for player in self.players]
+        # Contiguous: the fused Adam pairs weights and gradients by their place in memory.
+        self.players = [
+            {name: w.contiguous().requires_grad_() for name, w in start(self.draws).items()}
+            for _ in owned
+        ]
+        leaves = [list(player.values()) for player in self.players]
         self.optimizers = [
             torch.optim.Adam(own, settings.learning_rate, eps=settings.adam_epsilon, fused=True)
             for own in leaves

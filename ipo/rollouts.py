@@ -6,7 +6,7 @@ Axes: R runs, N copies of the environments, T steps.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -80,6 +80,13 @@ class FromGymnasium:
             self._by_run(truncated).bool(),
             self._by_run(last),
         )
+
+    def state(self) -> dict[str, Any]:
+        """Of environments that have one."""
+        return self.envs.state()
+
+    def restore(self, state: dict[str, Any]) -> None:
+        self.envs.restore(state)
 
     def _by_run(self, values: np.ndarray) -> Tensor:
         return torch.tensor(values, dtype=torch.float32).unflatten(0, (self.num_runs, -1))

@@ -189,7 +189,7 @@ class VectorDoor(gym.vector.VectorEnv):
     (``AutoresetMode.SAME_STEP``). ``info`` holds ``door_angle``, ``opened`` and
     ``episode_return`` so far, each ``[N]``; where episodes have ended they are those of the old
     episodes, and ``final_obs`` is there, too. ``episodes`` keeps ``(episode_return, opened)`` of
-    all that ended until somebody clears it.
+    all that ended until somebody clears it, ``frictions`` the domain of each door.
 
     Args:
         doors: for each door its friction, then the door is drawn from its seed; or its parameters.
@@ -220,9 +220,10 @@ class VectorDoor(gym.vector.VectorEnv):
         check_number("timestep", timestep, above=0)
         if num_workers > len(doors):
             raise ValueError(f"num_workers = {num_workers}: must be at most {len(doors)} doors")
-        for door in doors:
-            if not isinstance(door, DoorParams):
-                DoorParams(friction=door)
+        self.frictions = [
+            (door if isinstance(door, DoorParams) else DoorParams(friction=door)).friction
+            for door in doors
+        ]
         self.num_envs = len(doors)
         self.single_observation_space = gym.spaces.Box(-np.inf, np.inf, (15,), np.float64)
         self.single_action_space = gym.spaces.Box(-1.0, 1.0, (6,), np.float32)
