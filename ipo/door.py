@@ -278,7 +278,7 @@ def _add_handle(
     shift = np.array([0.0, *handle_shift])
     handle = door.add_body(name="handle", pos=params.handle_position + shift)
     handle.explicitinertial = True
-    handle.mass, handle.inertia = HANDLE_MASS, [1e-3, 1e-3, 1e-3]
+    handle.mass, handle.ipos, handle.inertia = HANDLE_MASS, [0, 0, 0], [1e-3, 1e-3, 1e-3]
     depth, half, fillet = params.handle_depth, params.handle_half_length, params.handle_fillet
     across = fillet * np.sqrt(0.5)
 
