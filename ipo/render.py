@@ -122,14 +122,18 @@ class DoorPicture:
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self.opengl)
         self.scene = mujoco.MjvScene(self.model, maxgeom=200)
         self.camera = mujoco.MjvCamera()
-        about, self.camera.distance, self.camera.azimuth, self.camera.elevation = CAMERAS[camera]
-        self.camera.lookat[:] = params.position + about
+        self.about, self.camera.distance, self.camera.azimuth, self.camera.elevation = CAMERAS[
+            camera
+        ]
+        self.follows = camera == "handle"
 
     def frame(self, qpos: np.ndarray, handle_shift: np.ndarray = (0.0, 0.0)) -> np.ndarray:
         """A picture ``[height, width, 3]`` of the joints ``[7]``."""
         shift_handle(self.model, self.params, handle_shift)
         self.data.qpos[:] = qpos
         mujoco.mj_forward(self.model, self.data)
+        center = self.data.body("handle").xpos if self.follows else self.params.position
+        self.camera.lookat[:] = center + self.about
         everything = mujoco.mjtCatBit.mjCAT_ALL
         mujoco.mjv_updateScene(
             self.model, self.data, mujoco.MjvOption(), None, self.camera, everything, self.scene
@@ -167,6 +171,14 @@ def door_scene(params: DoorParams, width: int = 640, height: int = 480) -> mujoc
         light.type = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
         light.dir = np.array([0.0, 0.0, 1.0]) - position
         light.diffuse, light.specular = [strength] * 3, [0.2 * shadow] * 3
+    spec.add_texture(
+        name="sky",
+        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT,
+        rgb1=[0.93, 0.95, 0.97],
+        width=16,
+        height=96,
+    )
     for name, (color, shininess, specular) in PAINTS.items():
         spec.add_material(name=name, rgba=[*color, 1], shininess=shininess, specular=specular)
     for geom in spec.geoms:
@@ -186,12 +198,13 @@ PAINTS = {
     "floor": ((0.62, 0.60, 0.57), 0.1, 0.1),
 }
 PAINTED = {"panel": "wood", "handle": "steel", "hook": "hook", "wrist": "robot"}
-# Point looked at from the door's position, distance, azimuth and elevation in degrees.
+# Point looked at, from the door's or the handle's position; distance; azimuth and elevation in
+# degrees.
 CAMERAS = {
-    "room": (np.array([0.35, 0.3, 0.0]), 2.9, 152.0, -14.0),
-    "handle": (np.array([0.12, 0.0, 0.0]), 0.75, 128.0, -28.0),
+    "room": (np.array([0.3, 0.2, 0.05]), 2.5, 140.0, -16.0),
+    "handle": (np.array([0.1, 0.05, 0.0]), 0.6, 160.0, -50.0),
 }
-FRAME, WALL = 0.08, 1.4  # widths beside the door
+FRAME, WALL = 0.08, 3.0  # widths beside the door
 
 
 def _add_surroundings(spec: mujoco.MjSpec, params: DoorParams) -> None:
@@ -206,7 +219,7 @@ def _add_surroundings(spec: mujoco.MjSpec, params: DoorParams) -> None:
         ("frame", (left, right), (top, top + FRAME), behind + 0.02),
         ("wall", (left - FRAME - WALL, left - FRAME), (0, top + FRAME), behind),
         ("wall", (right + FRAME, right + FRAME + WALL), (0, top + FRAME), behind),
-        ("wall", (left - FRAME - WALL, right + FRAME + WALL), (top + FRAME, top + 0.7), behind),
+        ("wall", (left - FRAME - WALL, right + FRAME + WALL), (top + FRAME, 4.0), behind),
     ]
     for number, (material, (y0, y1), (z0, z1), front) in enumerate(boxes):
         spec.worldbody.add_geom(
@@ -221,7 +234,7 @@ def _add_surroundings(spec: mujoco.MjSpec, params: DoorParams) -> None:
     spec.worldbody.add_geom(
         name="floor",
         type=mujoco.mjtGeom.mjGEOM_BOX,
-        size=[3, 3, 0.05],
+        size=[4, 4, 0.05],
         pos=[0, 0, -0.06],
         material="floor",
         contype=0,
