@@ -13,8 +13,8 @@ import numpy as np
 
 from ipo.door import FINGER, TUBES, DoorEnv
 
-# Where the inside of the hook lies, seen from a tube's axis, in the wrist's frame. The hook hangs on
-# the wrist, which is at +x, and its mouth is at -y.
+# Where the inside of the hook lies, seen from a tube's axis, in the wrist's frame. The hook hangs
+# on the wrist, which is at +x, and its mouth is at -y.
 INSIDE = {
     "hook_0": (0, -1, 0),  # the bow
     "hook_1": (1, 0, 0),  # the side away from the wrist, which holds what is hooked
