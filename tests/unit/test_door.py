@@ -399,7 +399,8 @@ def test_an_action_that_is_not_finite_names_door_and_step(bad, num_workers):
         doors.step(np.zeros((2, 6)))
 
 
-def test_a_simulation_that_diverges_names_door_and_step():
+def test_a_simulation_that_diverges_names_door_and_step(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes a log into the present folder
     doors = VectorDoor([0.0, 0.1])
     doors.reset(seed=0)
     doors.parts[0].doors.data[1].qvel[0] = 1e12
