@@ -18,14 +18,32 @@ import importlib.util
 import os
 import shutil
 import subprocess
+from ctypes.util import find_library
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 VENV = ROOT / ".venv"
 STAMP = VENV / "installed"
 
-# What Debian's packages are needed for: the program to look for, and what is lost without it.
-SYSTEM_PACKAGES = {"chromium": ("chromium", "the tests of the built site in a browser are skipped")}
+
+def draws_without_display():
+    """Whether OpenGL is there together with a driver."""
+    return find_library("EGL") and any(find_library(f"EGL_{name}") for name in ("mesa", "nvidia"))
+
+
+# Debian's packages, whether what they bring is there, and what is lost without them.
+SYSTEM_PACKAGES = (
+    (
+        ["chromium"],
+        lambda: shutil.which("chromium"),
+        "the tests of the built site in a browser are skipped",
+    ),
+    (
+        ["libegl1", "libgl1", "libgl1-mesa-dri", "libegl-mesa0"],
+        draws_without_display,
+        "doors are simulated, but not drawn",
+    ),
+)
 
 
 def install_environment():
@@ -53,9 +71,9 @@ def environment_key():
 
 def install_system_packages():
     """Install what is missing where that is allowed; otherwise say what to type. Never fails."""
-    for package, (program, loss) in SYSTEM_PACKAGES.items():
-        if shutil.which(program) is None:
-            apt_install([package], loss)
+    for packages, is_there, loss in SYSTEM_PACKAGES:
+        if not is_there():
+            apt_install(packages, loss)
 
 
 def apt_install(packages, loss):

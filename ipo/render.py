@@ -4,20 +4,26 @@ from __future__ import annotations
 
 import base64
 import html
+import importlib
 import io
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import imageio.v3 as iio
 import matplotlib.pyplot as plt
+import mujoco
 import numpy as np
 from gymnasium import Env
 from matplotlib.figure import Figure
 
+from ipo.checks import check_choice
+from ipo.door import DoorParams, build_door, shift_handle
+
 
 def record(
-    env: Env, act: Callable[[dict], int], seed: int, max_frames: int = 60
+    env: Env, act: Callable[[Any], Any], seed: int, max_frames: int = 60
 ) -> list[np.ndarray]:
     """Frames of one episode of ``act(observation) -> action``, the first one included."""
     observation, _ = env.reset(seed=seed)
@@ -75,4 +81,162 @@ def video(frames: Sequence[np.ndarray], caption: str, fps: int = 4) -> str:
         f'width="100%" poster="data:image/png;base64,{poster}">'
         f'<source type="video/mp4" src="data:video/mp4;base64,{film}"></video>'
         f"<p>{text}</p></div>"
+    )
+
+
+class DoorPicture:
+    """Pictures of a door and the robot, drawn by MuJoCo without a display.
+
+    The scene is a model of its own: frame, wall, floor, light and paint are not simulated, so
+    that a door which is drawn moves like one that is not.
+
+    Args:
+        params: the door.
+        width, height: of a picture, in pixels.
+        camera: ``room`` shows the robot in front of the door, ``handle`` how it holds on.
+
+    Raises:
+        RenderError: no OpenGL without a display (EGL) on this machine.
+    """
+
+    def __init__(
+        self, params: DoorParams, width: int = 640, height: int = 480, camera: str = "room"
+    ) -> None:
+        check_choice("camera", camera, CAMERAS)
+        self.params = params
+        self.model = door_scene(params, width, height).compile()
+        self.data = mujoco.MjData(self.model)
+        self.rectangle = mujoco.MjrRect(0, 0, width, height)
+        try:
+            # Not by mujoco.Renderer, which uses EGL only where an environment variable had been
+            # set before MuJoCo was imported.
+            self.context = importlib.import_module("mujoco.egl").GLContext(width, height)
+            self.context.make_current()
+            self.opengl = mujoco.MjrContext(self.model, mujoco.mjtFontScale.mjFONTSCALE_100)
+        except Exception as error:  # MuJoCo, PyOpenGL and ctypes each raise their own
+            raise RenderError(
+                "doors cannot be drawn: OpenGL without a display (EGL) does not start. On Debian: "
+                "sudo apt-get install libegl1 libgl1 libgl1-mesa-dri libegl-mesa0 "
+                f"(the cause was: {error})"
+            ) from error
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self.opengl)
+        self.scene = mujoco.MjvScene(self.model, maxgeom=200)
+        self.camera = mujoco.MjvCamera()
+        self.about, self.camera.distance, self.camera.azimuth, self.camera.elevation = CAMERAS[
+            camera
+        ]
+        self.follows = camera == "handle"
+
+    def frame(self, qpos: np.ndarray, handle_shift: np.ndarray = (0.0, 0.0)) -> np.ndarray:
+        """A picture ``[height, width, 3]`` of the joints ``[7]``."""
+        shift_handle(self.model, self.params, handle_shift)
+        self.data.qpos[:] = qpos
+        mujoco.mj_forward(self.model, self.data)
+        center = self.data.body("handle").xpos if self.follows else self.params.position
+        self.camera.lookat[:] = center + self.about
+        everything = mujoco.mjtCatBit.mjCAT_ALL
+        mujoco.mjv_updateScene(
+            self.model, self.data, mujoco.MjvOption(), None, self.camera, everything, self.scene
+        )
+        self.context.make_current()
+        mujoco.mjr_render(self.rectangle, self.scene, self.opengl)
+        picture = np.empty((self.rectangle.height, self.rectangle.width, 3), np.uint8)
+        mujoco.mjr_readPixels(picture, None, self.rectangle, self.opengl)
+        return picture[::-1]  # OpenGL counts lines from below
+
+    def close(self) -> None:
+        """Give the memory of OpenGL back."""
+        self.context.make_current()
+        self.opengl.free()
+        self.context.free()
+
+
+class RenderError(RuntimeError):
+    """No pictures can be drawn on this machine."""
+
+
+def door_scene(params: DoorParams, width: int = 640, height: int = 480) -> mujoco.MjSpec:
+    """:func:`ipo.door.build_door` with paint, light, frame, wall and floor, for pictures."""
+    spec = build_door(params)
+    spec.visual.global_.offwidth, spec.visual.global_.offheight = width, height
+    spec.visual.quality.shadowsize, spec.visual.quality.offsamples = 4096, 8
+    spec.visual.headlight.ambient, spec.visual.headlight.diffuse = [0.38] * 3, [0.25] * 3
+    spec.visual.headlight.specular = [0.05] * 3
+    spec.visual.map.znear, spec.visual.map.zfar = 0.01, 30
+    for position, strength, shadow in (
+        ((2.2, -1.6, 3.2), 0.55, True),
+        ((1.5, 2.0, 2.2), 0.25, False),
+    ):
+        light = spec.worldbody.add_light(pos=position, castshadow=shadow)
+        light.type = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
+        light.dir = np.array([0.0, 0.0, 1.0]) - position
+        light.diffuse, light.specular = [strength] * 3, [0.2 * shadow] * 3
+    spec.add_texture(
+        name="sky",
+        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT,
+        rgb1=[0.93, 0.95, 0.97],
+        width=16,
+        height=96,
+    )
+    for name, (color, shininess, specular) in PAINTS.items():
+        spec.add_material(name=name, rgba=[*color, 1], shininess=shininess, specular=specular)
+    for geom in spec.geoms:
+        geom.material = next(paint for part, paint in PAINTED.items() if geom.name.startswith(part))
+    _add_surroundings(spec, params)
+    return spec
+
+
+# Colour, shininess and specular reflection.
+PAINTS = {
+    "wood": ((0.72, 0.53, 0.36), 0.2, 0.2),
+    "steel": ((0.82, 0.83, 0.85), 0.8, 0.9),
+    "hook": ((0.10, 0.12, 0.16), 0.6, 0.5),
+    "robot": ((0.11, 0.39, 0.66), 0.5, 0.4),
+    "frame": ((0.93, 0.92, 0.89), 0.1, 0.1),
+    "wall": ((0.80, 0.83, 0.84), 0.0, 0.0),
+    "floor": ((0.62, 0.60, 0.57), 0.1, 0.1),
+}
+PAINTED = {"panel": "wood", "handle": "steel", "hook": "hook", "wrist": "robot"}
+# Point looked at, from the door's or the handle's position; distance; azimuth and elevation in
+# degrees.
+CAMERAS = {
+    "room": (np.array([0.3, 0.2, 0.05]), 2.5, 140.0, -16.0),
+    "handle": (np.array([0.1, 0.05, 0.0]), 0.6, 160.0, -50.0),
+}
+FRAME, WALL = 0.08, 3.0  # widths beside the door
+
+
+def _add_surroundings(spec: mujoco.MjSpec, params: DoorParams) -> None:
+    """What nothing collides with: a frame around the door, the wall, the floor."""
+    left = params.wall_offset - params.width / 2
+    right = params.wall_offset + params.width / 2
+    top = params.height
+    depth, behind = 0.06, 1.1 * params.thickness - params.thickness / 2
+    boxes = [
+        ("frame", (left - FRAME, left), (0, top + FRAME), behind + 0.02),
+        ("frame", (right, right + FRAME), (0, top + FRAME), behind + 0.02),
+        ("frame", (left, right), (top, top + FRAME), behind + 0.02),
+        ("wall", (left - FRAME - WALL, left - FRAME), (0, top + FRAME), behind),
+        ("wall", (right + FRAME, right + FRAME + WALL), (0, top + FRAME), behind),
+        ("wall", (left - FRAME - WALL, right + FRAME + WALL), (top + FRAME, 4.0), behind),
+    ]
+    for number, (material, (y0, y1), (z0, z1), front) in enumerate(boxes):
+        spec.worldbody.add_geom(
+            name=f"{material}_{number}",
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            size=[depth / 2, (y1 - y0) / 2, (z1 - z0) / 2],
+            pos=[front - depth / 2, (y0 + y1) / 2, (z0 + z1) / 2],
+            material=material,
+            contype=0,
+            conaffinity=0,
+        )
+    spec.worldbody.add_geom(
+        name="floor",
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        size=[4, 4, 0.05],
+        pos=[0, 0, -0.06],
+        material="floor",
+        contype=0,
+        conaffinity=0,
     )

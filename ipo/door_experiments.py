@@ -1,0 +1,107 @@
+"""From saved policies of the door experiment to tidy rows: which doors each of them opens.
+
+Every policy meets the same doors in the same starts, at every friction, so that comparisons are
+paired; the first n of them are the same however many there are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from ipo.checks import check_choice, check_count
+from ipo.door import DoorParams
+from ipo.door_training import CELLS, CHOICES, NETWORK, TRAIN_FRICTIONS, opened, policy_path
+from ipo.networks import load_policy
+from ipo.vector_door import VectorDoor
+
+MODULES = ("door_experiments",)
+TEST_FRICTIONS = (1.1, 1.2, 1.3, 1.4, 1.5)  # of the paper's Table 4
+MORE_FRICTIONS = (0.0, 0.1, 0.5, 2.0, 3.0)
+NUM_DOORS = 200
+EVALUATION_SEED = 20210607
+
+
+@dataclass(frozen=True)
+class Cell:
+    """Policies of one method after so many updates, on so many doors.
+
+    Attributes:
+        label: of a cell of :data:`ipo.door_training.CELLS`.
+        updates: after which the policy was saved.
+        choice: the ``best`` policy so far, as published, or the ``last``.
+        frictions: the domains in which they are tested.
+        num_doors: of each friction.
+    """
+
+    label: str
+    updates: int = 190
+    choice: str = "best"
+    frictions: tuple[float, ...] = TEST_FRICTIONS
+    num_doors: int = NUM_DOORS
+
+    def __post_init__(self) -> None:
+        check_choice("label", self.label, CELLS)
+        check_choice("choice", self.choice, CHOICES)
+        check_count("updates", self.updates)
+        check_count("num_doors", self.num_doors)
+        for friction in self.frictions:
+            DoorParams(friction=friction)
+
+    @property
+    def columns(self) -> dict[str, Any]:
+        settings = CELLS[self.label].settings
+        return {
+            "method": self.label,
+            "train_frictions": "+".join(map(str, TRAIN_FRICTIONS)),
+            "steps": self.updates * settings.num_steps * sum(settings.num_envs),
+            "choice": self.choice,
+        }
+
+
+def evaluate(cell: Cell, seeds: Sequence[int], policies: str | Path) -> pd.DataFrame:
+    """Rows with the cell's columns, ``run``, ``domain``, ``door``, ``metric`` and ``value``.
+
+    The metric is ``success``, 1 or 0; actions are the policy's most likely ones.
+
+    Raises:
+        ValueError: a file that is no policy for doors, or that was not made for this run.
+    """
+    parts = []
+    for seed in seeds:
+        path = policy_path(policies, cell.label, seed, cell.updates, cell.choice)
+        players, _ = load_policy(path, NETWORK, {"seed": seed, "choice": cell.choice})
+        for friction in cell.frictions:
+            found = opened(players, friction, cell.num_doors, EVALUATION_SEED)
+            parts.append(
+                pd.DataFrame(
+                    {
+                        **cell.columns,
+                        "run": seed,
+                        "domain": str(friction),
+                        "door": range(cell.num_doors),
+                        "metric": "success",
+                        "value": found.astype(float),
+                    }
+                )
+            )
+    return pd.concat(parts, ignore_index=True)
+
+
+def evaluation_doors(num_doors: int = NUM_DOORS) -> pd.DataFrame:
+    """What the doors of the evaluation are like: a row for each, without its friction.
+
+    The columns are those of :class:`ipo.door.DoorParams`, ``lever_arm``, and the handle's shift.
+    """
+    doors = VectorDoor([0.0] * num_doors)
+    doors.reset(seed=EVALUATION_SEED)
+    fleet = doors.parts[0].doors
+    rows = [
+        asdict(params) | {"lever_arm": params.lever_arm, "shift_y": y, "shift_z": z}
+        for params, (y, z) in zip(fleet.params, fleet.shifts, strict=True)
+    ]
+    return pd.DataFrame(rows).drop(columns="friction").rename_axis("door").reset_index()

@@ -1,0 +1,301 @@
+"""Training on doors: the published settings, runs that survive interruptions, saved policies.
+
+Test frictions are looked at while training, for the curves, but nothing depends on them.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import torch
+from tqdm import tqdm
+
+from ipo.checkpoints import CheckpointError, load_checkpoint, save_checkpoint
+from ipo.dense_network import DenseNetwork
+from ipo.distributions import Gaussian
+from ipo.networks import Weights, save_policy
+from ipo.ppo import Settings, Training
+from ipo.provenance import source_hash
+from ipo.vector_door import VectorDoor
+from ipo.vector_environments import FromGymnasium
+
+MODULES = ("door_training",)
+TRAIN_FRICTIONS = (0.0, 0.1)
+NETWORK = DenseNetwork(15, 6, Gaussian)
+NUM_LAST = 10  # training episodes whose mean return decides which policy is the best
+CURVE_FRICTION, NUM_CURVE_DOORS, CURVE_SEED = 1.3, 50, 20201106
+CHOICES = ("best", "last")
+
+
+def published(method: str, **changes: Any) -> Settings:
+    """The settings of the paper's runs on doors (Table 7), with ``changes``.
+
+    Where the published runs differ from the text, these are the runs': the table's batch size of
+    256 was the number of minibatches, rewards were normalised, and training IPO ended after 95
+    updates, 12.5 million steps. The loss of the critic had a factor 1/2 besides its weight 0.5.
+    """
+    paper = {
+        "learning_rate": 5e-4 if method == "ipo" else 1e-3,
+        "adam_epsilon": 1e-5,
+        "num_updates": 190,
+        "num_envs": (24, 8),
+        "num_steps": 4096,
+        "num_epochs": 10,
+        "num_minibatches": 256,
+        "value_weight": 0.25,
+        "normalize_rewards": True,
+        "normalize_advantages": "rollout",
+        "time_outs": "no_advantage",
+    }
+    return Settings(method, **(paper | changes))
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One configuration of the training.
+
+    Attributes:
+        label: the method's name in the rows.
+        settings: how it is trained.
+        saved_after: the policies are saved after so many updates. A training that ends there
+            would be the same: its random streams do not depend on how long it will last.
+        curve_every: updates between two looks at a friction that is not trained on.
+    """
+
+    label: str
+    settings: Settings
+    saved_after: tuple[int, ...] = (95, 190)
+    curve_every: int = 10
+
+    def __post_init__(self) -> None:
+        for updates in self.saved_after:
+            if not 0 < updates <= self.settings.num_updates:
+                raise ValueError(
+                    f"saved_after = {self.saved_after}: must be between 1 and "
+                    f"num_updates = {self.settings.num_updates}"
+                )
+
+    @property
+    def columns(self) -> dict[str, Any]:
+        return {"method": self.label, "train_frictions": "+".join(map(str, TRAIN_FRICTIONS))}
+
+
+CELLS = {
+    cell.label: cell
+    for cell in (
+        Cell("ppo", published("ppo")),
+        Cell("ipo", published("ipo")),
+        Cell("ipo_lr1e-3", published("ipo", learning_rate=1e-3)),
+        Cell("ensemble", published("ensemble", learning_rate=5e-4)),
+    )
+}
+
+
+def train_run(
+    cell: Cell,
+    seeds: Sequence[int],
+    checkpoints: str | Path,
+    policies: str | Path,
+    progress: bool = True,
+) -> pd.DataFrame:
+    """Train one run, or go on where it was interrupted; save its policies; its learning curve.
+
+    The state is saved after every update in ``checkpoints``, and removed in the end.
+
+    Returns:
+        rows with the cell's columns, ``frames``, ``run``, ``domain``, ``metric`` and ``value``.
+        Metrics of training episodes, whose actions are random: ``return``, ``success``;
+        ``deviation``, the mean of the policy's standard deviations; of the most likely actions on
+        the same fresh doors: ``success_most_likely``; ``cpu_seconds``.
+
+    Raises:
+        CheckpointError: a check-point of other code or settings, or one that cannot be written.
+    """
+    (seed,) = seeds
+    run = Run(cell, seed, Path(checkpoints), Path(policies))
+    bar = tqdm(
+        total=cell.settings.num_updates,
+        initial=run.num_updates,
+        desc=f"{cell.label} {seed}",
+        unit="update",
+        disable=not progress,
+        leave=False,
+    )
+    with bar:
+        while run.num_updates < cell.settings.num_updates:
+            run.update()
+            bar.update()
+    run.remove_checkpoints()
+    return run.rows()
+
+
+class Run:
+    """One run of a cell, with its check-point."""
+
+    def __init__(self, cell: Cell, seed: int, checkpoints: Path, policies: Path) -> None:
+        self.cell, self.seed, self.policies = cell, seed, policies
+        self.checkpoint = checkpoints / f"{cell.label}_{seed}.checkpoint"
+        self.training = Training(
+            NETWORK, NETWORK.start, make_doors, len(TRAIN_FRICTIONS), cell.settings, [seed]
+        )
+        self.num_updates = 0
+        self.cpu_seconds = 0.0
+        self.best_return = -np.inf
+        self.best: list[Weights] = []
+        self.curve: list[list[Any]] = []  # frames, domain, metric, value
+        # Plain values, as they come back from JSON.
+        self.identity = {
+            "settings": listed(asdict(cell)),
+            "seed": seed,
+            "source": source_hash(MODULES),
+        }
+        state = load_checkpoint(self.checkpoint)
+        if state is not None:
+            self._restore(state)
+
+    def update(self) -> None:
+        """One update of all players; then save policies where it is time, and the state."""
+        before = time.process_time()
+        self.training.update()
+        self.num_updates += 1
+        self._note_episodes()
+        if self.num_updates % self.cell.curve_every == 0:
+            found = opened(self.training.players, CURVE_FRICTION, NUM_CURVE_DOORS, CURVE_SEED)
+            self._note(CURVE_FRICTION, "success_most_likely", found.mean())
+        self.cpu_seconds += time.process_time() - before
+        self._note("training", "cpu_seconds", self.cpu_seconds)
+        if self.num_updates in self.cell.saved_after:
+            self._save_policies()
+        save_checkpoint(self.checkpoint, self._state())
+
+    def rows(self) -> pd.DataFrame:
+        return pd.DataFrame(
+            {
+                **self.cell.columns,
+                "frames": frames,
+                "run": self.seed,
+                "domain": str(domain),
+                "metric": metric,
+                "value": float(value),
+            }
+            for frames, domain, metric, value in self.curve
+        )
+
+    def remove_checkpoints(self) -> None:
+        for path in self.checkpoint.parent.glob(f"{self.checkpoint.name}*"):
+            path.unlink()
+
+    def _note(self, domain: float | str, metric: str, value: float) -> None:
+        self.curve.append([self.training.num_frames, domain, metric, float(value)])
+
+    def _note_episodes(self) -> None:
+        """Returns and successes of the episodes of this update, and the best policy so far.
+
+        The last ten episodes, by which the published runs choose, are the last to end; of those
+        that end together, the doors with more friction come last.
+        """
+        frictions, returns, successes = [], [], []
+        for environments in self.training.environments:
+            doors = environments.envs
+            for episode_returns, episode_opened in doors.episodes:
+                frictions.extend(doors.frictions)
+                returns.extend(episode_returns)
+                successes.extend(episode_opened)
+            doors.episodes.clear()
+        for friction in TRAIN_FRICTIONS:
+            chosen = np.array(frictions) == friction
+            self._note(friction, "return", np.array(returns)[chosen].mean())
+            self._note(friction, "success", np.array(successes)[chosen].mean())
+        deviations = [player["log_std"].detach().exp() for player in self.training.players]
+        self._note("training", "deviation", torch.stack(deviations).mean())
+        last = float(np.mean(returns[-NUM_LAST:]))
+        if last > self.best_return:
+            self.best_return, self.best = last, copied(self.training.players)
+
+    def _save_policies(self) -> None:
+        about = {
+            **self.identity,
+            "updates": self.num_updates,
+            "frames": self.training.num_frames,
+            "cpu_seconds": round(self.cpu_seconds, 1),
+            "versions": {name: version(name) for name in ("torch", "numpy", "mujoco")},
+        }
+        for choice, players in (("best", self.best), ("last", self.training.players)):
+            path = policy_path(self.policies, self.cell.label, self.seed, self.num_updates, choice)
+            save_policy(path, players, about | {"choice": choice})
+
+    def _state(self) -> dict[str, Any]:
+        return {
+            "identity": self.identity,
+            "training": self.training.state(),
+            "num_updates": self.num_updates,
+            "cpu_seconds": self.cpu_seconds,
+            "best_return": self.best_return,
+            "best": self.best,
+            "curve": self.curve,
+        }
+
+    def _restore(self, state: dict[str, Any]) -> None:
+        if state["identity"] != self.identity:
+            raise CheckpointError(
+                f"{self.checkpoint}: was made by other code or settings; delete it to begin anew"
+            )
+        self.training.restore(state["training"])
+        for name in ("num_updates", "cpu_seconds", "best_return", "best", "curve"):
+            setattr(self, name, state[name])
+
+
+def make_doors(
+    domains: list[int], num_copies: list[int], generators: Sequence[np.random.Generator]
+) -> FromGymnasium:
+    """Random doors of the training frictions, for the one run that there is."""
+    (generator,) = generators
+    frictions = np.repeat([TRAIN_FRICTIONS[domain] for domain in domains], num_copies)
+    return FromGymnasium(VectorDoor(frictions.tolist()), 1, int(generator.integers(2**63)))
+
+
+def opened(
+    players: Sequence[Weights], friction: float, num_doors: int, seed: int, **options: Any
+) -> np.ndarray:
+    """Which of ``num_doors`` fresh doors the players' average opens, by its most likely actions.
+
+    The doors and the starts are those of the seed, whoever is asked and at every friction.
+    ``options`` are those of :class:`ipo.vector_door.VectorDoor`.
+    """
+    doors = VectorDoor([friction] * num_doors, **options)
+    try:
+        policy = NETWORK.frozen(players)
+        observations, _ = doors.reset(seed=seed)
+        while True:
+            rows = torch.tensor(observations, dtype=torch.float32).unsqueeze(0)
+            actions = Gaussian.mode(policy(rows)[0])[0]
+            observations, _, _, truncated, info = doors.step(actions.numpy())
+            if truncated.all():
+                return info["opened"]
+    finally:
+        doors.close()
+
+
+def policy_path(
+    folder: str | Path, label: str, seed: int, num_updates: int, choice: str = "best"
+) -> Path:
+    """The file of a run's policy after so many updates."""
+    return Path(folder) / f"{label}_{seed}_{num_updates}_{choice}.safetensors"
+
+
+def copied(players: Sequence[Weights]) -> list[Weights]:
+    return [{name: w.detach().clone() for name, w in player.items()} for player in players]
+
+
+def listed(tree: Any) -> Any:
+    """A tree with lists for tuples, as JSON has it."""
+    if isinstance(tree, dict):
+        return {key: listed(part) for key, part in tree.items()}
+    return [listed(part) for part in tree] if isinstance(tree, list | tuple) else tree

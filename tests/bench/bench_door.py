@@ -1,0 +1,186 @@
+"""Speed of the doors: simulation, one update of PPO and of IPO, memory, two processes.
+
+    python tests/bench/bench_door.py [--blocks 6] [--steps 60] [--json PATH]
+
+CPU time is compared in short blocks that take turns, so that a busy machine slows all alike. What
+training needs is the published settings' rollout and updates, measured once and multiplied; the
+wall time of one and two workers is only worth something on a machine that is otherwise idle.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+from tqdm import tqdm
+
+from ipo.door import DoorEnv
+from ipo.door_training import NETWORK, TRAIN_FRICTIONS, make_doors, published
+from ipo.ppo import Training, improve
+from ipo.rollouts import collect
+from ipo.vector_door import VectorDoor
+
+FRICTIONS = [0.0] * 24 + [0.1] * 8
+UPDATES = 190  # of 131,072 steps each: 25 million
+
+
+def cpu_seconds(work: Callable[[], object]) -> float:
+    before = time.process_time()
+    work()
+    return time.process_time() - before
+
+
+def acting(timestep: float) -> Callable[[int], None]:
+    """32 doors with random actions of a policy, as in training."""
+    doors = VectorDoor(FRICTIONS, timestep=timestep)
+    policy = NETWORK.frozen([NETWORK.start([np.random.default_rng(0)])])
+    generator = [np.random.default_rng(0)]
+    state = {"observations": doors.reset(seed=0)[0]}
+
+    def run(num_steps: int) -> None:
+        for _ in range(num_steps):
+            rows = torch.tensor(state["observations"], dtype=torch.float32).unsqueeze(0)
+            actions = NETWORK.distribution.sample(policy(rows)[0], generator)[0]
+            state["observations"] = doors.step(actions.numpy())[0]
+
+    return run
+
+
+def one_at_a_time() -> Callable[[int], None]:
+    """The published time step, one environment, and the network in torch."""
+    env, weights = DoorEnv(0.0, timestep=0.001), NETWORK.start([np.random.default_rng(0)])
+    generator = [np.random.default_rng(0)]
+    state = {"observation": env.reset(seed=0)[0]}
+
+    @torch.no_grad()
+    def run(num_steps: int) -> None:
+        for _ in range(num_steps):
+            rows = torch.tensor(state["observation"], dtype=torch.float32)[None, None]
+            parameters, _ = NETWORK(weights, rows)
+            action = NETWORK.distribution.sample(parameters, generator)[0, 0]
+            state["observation"], _, _, truncated, _ = env.step(action.numpy())
+            if truncated:
+                state["observation"], _ = env.reset()
+
+    return run
+
+
+def simulation(num_steps: int, num_blocks: int) -> dict[str, list[float]]:
+    """Steps of a door per CPU second, and ratios, block by block."""
+    ways = {
+        "0.004 s, 32 doors": (acting(0.004), 32),
+        "0.001 s, 32 doors": (acting(0.001), 32),
+        "0.001 s, one by one": (one_at_a_time(), 1),
+    }
+    speeds: dict[str, list[float]] = {name: [] for name in ways}
+    for _ in tqdm(range(num_blocks), desc="simulation", unit="block"):
+        for name, (run, num_doors) in ways.items():
+            number = num_steps * (32 // num_doors) // (4 if num_doors == 1 else 1)
+            spent = cpu_seconds(lambda run=run, number=number: run(number))
+            speeds[name].append(number * num_doors / spent)
+    fast, *slow = speeds
+    for name in slow:
+        pairs = zip(speeds[fast], speeds[name], strict=True)
+        speeds[f"ratio to {name}"] = [a / b for a, b in pairs]
+    return speeds
+
+
+def update_costs(method: str) -> dict[str, float]:
+    """CPU seconds of a published update: simulation, and what learning costs."""
+    settings = published(method)
+    training = Training(NETWORK, NETWORK.start, make_doors, len(TRAIN_FRICTIONS), settings, [0])
+    costs = {"simulation": 0.0, "learning": 0.0}
+    for d in range(len(training.players)):
+        found = []
+        costs["simulation"] += cpu_seconds(
+            lambda d=d, found=found: found.append(
+                collect(
+                    NETWORK.frozen(training.players),
+                    NETWORK.distribution,
+                    training.environments[d],
+                    training.observations[d],
+                    settings.num_steps,
+                    training.draws,
+                    training.normalizers[d],
+                    settings.discount,
+                    settings.gae_lambda,
+                    settings.time_outs,
+                )
+            )
+        )
+        frames = found[0][0].frames()
+        costs["learning"] += cpu_seconds(
+            lambda d=d, frames=frames: improve(
+                NETWORK,
+                training.players,
+                d,
+                training.optimizers[d],
+                frames,
+                settings,
+                training.orders,
+            )
+        )
+    return costs
+
+
+def wall_speed(num_workers: int, num_steps: int) -> float:
+    """Steps of 256 doors per second of the clock."""
+    doors = VectorDoor([0.0] * 256, num_workers=num_workers)
+    doors.reset(seed=0)
+    actions = np.random.default_rng(0).normal(size=(num_steps, 256, 6))
+    doors.step(actions[0])
+    before = time.perf_counter()
+    for action in actions:
+        doors.step(action)
+    speed = num_steps * 256 / (time.perf_counter() - before)
+    doors.close()
+    return speed
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--blocks", type=int, default=6)
+    parser.add_argument("--steps", type=int, default=60, help="of 32 doors in each block")
+    parser.add_argument("--json", type=Path, metavar="PATH", help="write the numbers there, too")
+    options = parser.parse_args()
+    if options.blocks < 1 or options.steps < 4:
+        parser.error("must be: --blocks >= 1, --steps >= 4")
+
+    torch.set_num_threads(1)
+    speeds = {
+        name: statistics.median(values)
+        for name, values in simulation(options.steps, options.blocks).items()
+    }
+    print("Steps of a door per CPU second, with the policy; ratios")
+    for name, value in speeds.items():
+        print(f"  {name:32}{value:12,.1f}")
+    costs = {method: update_costs(method) for method in ("ppo", "ipo")}
+    print("CPU minutes of 25 million steps")
+    for method, parts in costs.items():
+        minutes = {name: seconds * UPDATES / 60 for name, seconds in parts.items()}
+        text = ", ".join(f"{name} {value:.1f}" for name, value in minutes.items())
+        print(f"  {method:32}{sum(minutes.values()):12.1f}   ({text})")
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    print(f"Memory at its peak: {memory:.2f} GiB")
+    workers = {number: wall_speed(number, options.steps) for number in (1, 2)}
+    print(f"Steps per second of the clock, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}")
+    for number, value in workers.items():
+        print(f"  {number} workers {value:33,.1f}")
+    if options.json:
+        numbers = {"speeds": speeds, "update_cpu_seconds": costs, "memory_gib": memory}
+        text = json.dumps(numbers | {"workers": workers}, indent=1) + "\n"
+        temporary = options.json.with_name(f"{options.json.name}.tmp")
+        temporary.write_text(text)
+        os.replace(temporary, options.json)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,189 @@
+"""Check-points: what comes back, what damage does, and training that goes on."""
+
+import errno
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+import torch
+
+from ipo import checkpoints, door_training
+from ipo.checkpoints import (
+    CheckpointError,
+    CheckpointWarning,
+    load_checkpoint,
+    previous,
+    save_checkpoint,
+)
+from ipo.door_training import NETWORK, Cell, Run, published, train_run
+from ipo.networks import load_policy
+
+TREE = {
+    "number": 3,
+    "big": 2**100,
+    "nothing": None,
+    "list": [1.5, {"deep": torch.arange(6).reshape(2, 3)}],
+    "array": np.array([[0.1, 0.2]]),
+    "transposed": torch.arange(6.0).reshape(2, 3).T,
+}
+
+
+def test_a_tree_comes_back(tmp_path):
+    save_checkpoint(tmp_path / "c", TREE)
+    found = load_checkpoint(tmp_path / "c")
+    assert {name: found[name] for name in ("number", "big", "nothing")} == {
+        "number": 3,
+        "big": 2**100,
+        "nothing": None,
+    }
+    assert found["list"][0] == 1.5
+    assert torch.equal(found["list"][1]["deep"], TREE["list"][1]["deep"])
+    assert torch.equal(found["array"], torch.tensor([[0.1, 0.2]], dtype=torch.float64))
+    assert torch.equal(found["transposed"], TREE["transposed"])
+
+
+def test_nothing_saved_is_nothing(tmp_path):
+    assert load_checkpoint(tmp_path / "c") is None
+
+
+@pytest.mark.parametrize("damage", ["cut", "byte", "empty", "text"])
+def test_a_damaged_file_is_passed_over_with_a_message(tmp_path, damage):
+    path = tmp_path / "c"
+    save_checkpoint(path, {"number": 1})
+    save_checkpoint(path, {"number": 2})
+    content = path.read_bytes()
+    changed = {
+        "cut": content[:-5],
+        "byte": content[:-3] + bytes([content[-3] ^ 1]) + content[-2:],
+        "empty": b"",
+        "text": b"not a check-point",
+    }[damage]
+    path.write_bytes(changed)
+    with pytest.warns(CheckpointWarning, match="is cut short or changed; looking for the one"):
+        assert load_checkpoint(path) == {"number": 1}
+
+
+def test_two_damaged_files_are_an_error(tmp_path):
+    path = tmp_path / "c"
+    for _ in range(2):
+        save_checkpoint(path, {"number": 1})
+    for file in (path, previous(path)):
+        file.write_bytes(b"")
+    with (
+        pytest.warns(CheckpointWarning),
+        pytest.raises(CheckpointError, match="no check-point is whole; delete them"),
+    ):
+        load_checkpoint(path)
+
+
+def test_a_full_disk_leaves_what_was_there(tmp_path, monkeypatch):
+    path = tmp_path / "c"
+    save_checkpoint(path, {"number": 1})
+
+    def full(_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(checkpoints.os, "fsync", full)
+    with pytest.raises(CheckpointError, match=r"cannot be written \(No space left on device\)"):
+        save_checkpoint(path, {"number": 2})
+    assert load_checkpoint(path) == {"number": 1}
+    assert [file.name for file in tmp_path.iterdir()] == ["c"]
+
+
+# ------------------------------------------------------------------------- training on doors
+
+
+@pytest.fixture(autouse=True)
+def few_doors(monkeypatch):
+    monkeypatch.setattr(door_training, "NUM_CURVE_DOORS", 2)
+
+
+def small(method: str = "ipo", num_updates: int = 3) -> Cell:
+    """Rollouts that end in the middle of an episode."""
+    settings = published(
+        method, num_updates=num_updates, num_envs=(2, 2), num_steps=530, num_minibatches=4
+    )
+    return Cell(method, settings, saved_after=(2, num_updates), curve_every=2)
+
+
+def without_time(rows):
+    return rows[rows["metric"] != "cpu_seconds"].reset_index(drop=True)
+
+
+def test_an_interrupted_run_ends_as_if_nothing_had_happened(tmp_path):
+    cell = small("ipo")
+    whole = train_run(cell, [5], tmp_path / "a", tmp_path / "whole", progress=False)
+    for _ in range(2):
+        Run(cell, 5, tmp_path / "b", tmp_path / "parts").update()  # each goes on where one ended
+    parts = train_run(cell, [5], tmp_path / "b", tmp_path / "parts", progress=False)
+    assert without_time(parts).equals(without_time(whole))
+    names = {f"ipo_5_{n}_{choice}.safetensors" for n in (2, 3) for choice in ("best", "last")}
+    assert {file.name for file in (tmp_path / "whole").iterdir()} == names
+    for name in names:
+        (one, _), (other, _) = (
+            load_policy(tmp_path / folder / name, NETWORK) for folder in ("whole", "parts")
+        )
+        for d, player in enumerate(one):
+            assert all(torch.equal(w, other[d][n]) for n, w in player.items())
+    assert not list((tmp_path / "a").iterdir())
+
+
+def test_a_shorter_training_is_the_beginning_of_a_longer_one(tmp_path):
+    short, long = (
+        train_run(small(num_updates=n), [0], tmp_path / str(n), tmp_path / "p", progress=False)
+        for n in (2, 3)
+    )
+    assert without_time(short).equals(without_time(long)[: len(without_time(short))])
+
+
+def test_a_checkpoint_of_other_settings_is_refused(tmp_path):
+    Run(small("ppo"), 0, tmp_path, tmp_path).update()
+    other = Cell("ppo", published("ppo", learning_rate=0.1, num_updates=3), saved_after=(3,))
+    with pytest.raises(CheckpointError, match="made by other code or settings; delete it"):
+        Run(other, 0, tmp_path, tmp_path)
+
+
+def test_the_best_policy_is_that_of_the_best_last_ten_episodes(tmp_path, monkeypatch):
+    run = Run(small("ppo", 3), 0, tmp_path / "c", tmp_path / "p")
+    run.update()
+    first = [w.clone() for w in run.best[0].values()]
+    run.best_return = np.inf  # nothing can be better any more
+    run.update()
+    assert all(torch.equal(a, b) for a, b in zip(first, run.best[0].values(), strict=True))
+    best, _ = load_policy(door_training.policy_path(tmp_path / "p", "ppo", 0, 2), NETWORK)
+    last, _ = load_policy(door_training.policy_path(tmp_path / "p", "ppo", 0, 2, "last"), NETWORK)
+    assert torch.equal(best[0]["actor1.weight"], first[0])
+    assert not torch.equal(last[0]["actor1.weight"], first[0])
+
+
+def test_policies_are_saved_within_the_training_only():
+    with pytest.raises(ValueError, match=r"saved_after = \(95, 190\): must be between 1 and"):
+        Cell("ppo", published("ppo", num_updates=100))
+
+
+def test_kill_loses_one_update_at_most(tmp_path):
+    script = tmp_path / "train.py"
+    script.write_text(
+        "import torch\n"
+        "from ipo.door_training import Cell, published, train_run\n"
+        "torch.set_num_threads(1)\n"
+        "settings = published('ppo', num_updates=50, num_envs=(1, 1), num_steps=512,\n"
+        "                     num_minibatches=2, num_epochs=1)\n"
+        "cell = Cell('ppo', settings, saved_after=(50,), curve_every=50)\n"
+        f"train_run(cell, [0], {str(tmp_path / 'c')!r}, {str(tmp_path / 'p')!r})\n"
+    )
+    process = subprocess.Popen([sys.executable, script], stderr=subprocess.DEVNULL)
+    path = tmp_path / "c" / "ppo_0.checkpoint"
+    for _ in range(600):
+        if previous(path).exists():
+            break
+        time.sleep(0.05)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    found = load_checkpoint(path)
+    assert found["num_updates"] >= 2
+    assert found["training"]["num_frames"] == found["num_updates"] * 1024

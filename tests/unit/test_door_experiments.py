@@ -1,0 +1,107 @@
+"""Evaluation of policies on doors: the same doors for everyone, and rows as agreed."""
+
+import numpy as np
+import pytest
+
+from ipo import door_training
+from ipo.dense_network import DenseNetwork
+from ipo.door import DoorEnv
+from ipo.door_experiments import EVALUATION_SEED, Cell, evaluate, evaluation_doors
+from ipo.door_training import CELLS, NETWORK, opened, policy_path, published
+from ipo.networks import save_policy
+
+
+@pytest.fixture
+def policies(tmp_path):
+    """Of two runs of IPO, untrained."""
+    for seed in (0, 1):
+        players = [NETWORK.start([np.random.default_rng([seed, d])]) for d in range(2)]
+        path = policy_path(tmp_path, "ipo", seed, 95, "last")
+        save_policy(path, players, {"seed": seed, "choice": "last"})
+    return tmp_path
+
+
+def cell(**changes) -> Cell:
+    options = {"label": "ipo", "updates": 95, "choice": "last", "frictions": (0.0, 1.5)}
+    return Cell(**(options | {"num_doors": 3} | changes))
+
+
+def test_a_row_for_every_run_friction_and_door(policies):
+    rows = evaluate(cell(), [0, 1], policies)
+    assert len(rows) == 2 * 2 * 3
+    assert list(rows.columns) == [
+        *cell().columns, "run", "domain", "door", "metric", "value",
+    ]  # fmt: skip
+    assert set(rows["steps"]) == {95 * 4096 * 32}
+    assert set(rows["domain"]) == {"0.0", "1.5"}
+    assert set(rows["value"]) <= {0.0, 1.0}
+    fewer = evaluate(cell(num_doors=2), [1], policies)["value"]
+    same = rows[(rows["run"] == 1) & (rows["door"] < 2)]["value"]
+    assert list(fewer) == list(same)
+
+
+def test_the_same_doors_at_every_friction(monkeypatch):
+    """A hook that never moves opens nothing; the door that it meets is the one of the table."""
+    table = evaluation_doors(3)
+    seen = []
+
+    class Spy(door_training.VectorDoor):
+        def close(self, **options):
+            seen.append(self.parts[0].doors.params)
+            super().close(**options)
+
+    monkeypatch.setattr(door_training, "VectorDoor", Spy)
+    players = [NETWORK.start([np.random.default_rng(0)])]
+    for friction in (0.0, 1.5):
+        opened(players, friction, 3, EVALUATION_SEED, max_steps=2)
+    for doors, friction in zip(seen, (0.0, 1.5), strict=True):
+        assert [door.friction for door in doors] == [friction] * 3
+        assert [door.width for door in doors] == list(table["width"])
+        np.testing.assert_allclose([door.lever_arm for door in doors], table["lever_arm"])
+
+
+def test_a_door_of_the_evaluation_can_be_made_alone():
+    streams = np.random.SeedSequence(EVALUATION_SEED).spawn(2)
+    env = DoorEnv(0.0)
+    env.reset(seed=int(streams[1].generate_state(1)[0]))
+    row = evaluation_doors(2).iloc[1]
+    assert env.params.height == row["height"]
+    np.testing.assert_allclose(env.handle_shift, [row["shift_y"], row["shift_z"]])
+
+
+def test_the_published_settings():
+    ppo, ipo = published("ppo"), published("ipo")
+    assert (ppo.learning_rate, ipo.learning_rate) == (1e-3, 5e-4)
+    assert ppo.num_updates * 32 * ppo.num_steps == pytest.approx(25e6, rel=0.01)
+    assert ppo.size_of_minibatches(32 * 4096) == 512
+    assert [ipo.size_of_minibatches(n * 4096) for (n,) in ipo.copies_of_players(2)] == [384, 128]
+    assert CELLS["ensemble"].settings.copies_of_players(2) == [[12, 4], [12, 4]]
+
+
+@pytest.mark.parametrize(
+    ("change", "error"),
+    [
+        ({"label": "ipoo"}, "label = 'ipoo': .* did you mean 'ipo'"),
+        ({"choice": "worst"}, "choice = 'worst': must be one of best, last"),
+        ({"num_doors": 0}, "num_doors = 0: must be at least 1"),
+        ({"updates": 0}, "updates = 0: must be at least 1"),
+        ({"frictions": (-1.0,)}, "friction = -1.0: must be at least 0"),
+    ],
+)
+def test_an_evaluation_that_makes_no_sense_is_refused(change, error):
+    with pytest.raises(ValueError, match=error):
+        cell(**change)
+
+
+def test_a_policy_of_the_wrong_size_or_run_is_refused(tmp_path, policies):
+    small = DenseNetwork(15, 6, hidden=(8,)).start([np.random.default_rng(0)])
+    path = policy_path(policies, "ipo", 0, 95, "last")
+    save_policy(path, [small], {"seed": 0, "choice": "last"})
+    with pytest.raises(ValueError, match=r"actor1.weight of player 0 has shape .*, needs"):
+        evaluate(cell(), [0], policies)
+    policy_path(policies, "ipo", 1, 95, "last").rename(path)
+    with pytest.raises(ValueError, match="was made for seed = 1, not 0"):
+        evaluate(cell(), [0], policies)
+    path.write_bytes(path.read_bytes()[:1000])
+    with pytest.raises(ValueError, match="cannot be read as a policy"):
+        evaluate(cell(), [0], policies)
