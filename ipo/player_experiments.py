@@ -91,7 +91,7 @@ def _alone(training: Training, d: int, num_updates: int) -> list[Weights]:
 
 def _scores(task: Keys, player: Weights, colors: Sequence[str]) -> Tensor:
     """What a player alone says ``[R, observations, A]``, up to what the softmax ignores."""
-    scores = torch.cat([task.logits([player], color) for color in colors], dim=1)
+    scores = torch.cat([task.logits([player], task.tasks[color].images) for color in colors], dim=1)
     return scores - scores.mean(-1, keepdim=True)
 
 
@@ -104,7 +104,9 @@ def _correlation(one: Tensor, other: Tensor) -> Tensor:
 def _returns(task: Keys, players: Sequence[Weights], colors: Sequence[str]) -> list[np.ndarray]:
     """Exact return ``[R]`` of the players' average in each colour."""
     return [
-        expected_return(task.tasks[color], task.logits(players, color).softmax(-1).numpy())[0]
+        expected_return(
+            task.tasks[color], task.logits(players, task.tasks[color].images).softmax(-1).numpy()
+        )[0]
         for color in colors
     ]
 
