@@ -152,6 +152,7 @@ def fingerprint(notebook: Notebook) -> str:
         notebook.root / "data" / "paper",
         notebook.root / "data" / "results" / notebook.name,
         notebook.root / "data" / "policies" / notebook.name,
+        notebook.root / "data" / "bench",
     )
     everything = {
         "code": code,
