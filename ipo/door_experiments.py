@@ -11,13 +11,13 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from ipo.checks import check_choice, check_count
-from ipo.door import DoorParams
+from ipo.door import DoorEnv, DoorParams
 from ipo.door_training import CELLS, CHOICES, NETWORK, TRAIN_FRICTIONS, opened, policy_path
-from ipo.networks import load_policy
-from ipo.vector_door import VectorDoor
+from ipo.networks import Weights, load_policy
 
 MODULES = ("door_experiments",)
 TEST_FRICTIONS = (1.1, 1.2, 1.3, 1.4, 1.5)  # of the paper's Table 4
@@ -34,6 +34,7 @@ class Cell:
         label: of a cell of :data:`ipo.door_training.CELLS`.
         updates: after which the policy was saved.
         choice: the ``best`` policy so far, as published, or the ``last``.
+        player: the number of the player who acts alone; ``None``: all players' average.
         frictions: the domains in which they are tested.
         num_doors: of each friction.
     """
@@ -41,6 +42,7 @@ class Cell:
     label: str
     updates: int = 190
     choice: str = "best"
+    player: int | None = None
     frictions: tuple[float, ...] = TEST_FRICTIONS
     num_doors: int = NUM_DOORS
 
@@ -48,19 +50,33 @@ class Cell:
         check_choice("label", self.label, CELLS)
         check_choice("choice", self.choice, CHOICES)
         check_count("updates", self.updates)
-        check_count("num_doors", self.num_doors)
-        for friction in self.frictions:
-            DoorParams(friction=friction)
+        check_tested(self.frictions, self.num_doors)
+        if self.player is not None and not 0 <= self.player < num_players(self.label):
+            raise ValueError(
+                f"player = {self.player!r}: must be None or less than {num_players(self.label)}"
+            )
 
     @property
     def columns(self) -> dict[str, Any]:
         settings = CELLS[self.label].settings
+        alone = "" if self.player is None else f"_player_{self.player}"
         return {
-            "method": self.label,
+            "method": self.label + alone,
             "train_frictions": "+".join(map(str, TRAIN_FRICTIONS)),
             "steps": self.updates * settings.num_steps * sum(settings.num_envs),
             "choice": self.choice,
         }
+
+
+def check_tested(frictions: Sequence[float], num_doors: int) -> None:
+    check_count("num_doors", num_doors)
+    for friction in frictions:
+        DoorParams(friction=friction)
+
+
+def num_players(label: str) -> int:
+    """How many networks a cell's policies average."""
+    return len(CELLS[label].settings.domains_of_players(len(TRAIN_FRICTIONS)))
 
 
 def evaluate(cell: Cell, seeds: Sequence[int], policies: str | Path) -> pd.DataFrame:
@@ -73,8 +89,7 @@ def evaluate(cell: Cell, seeds: Sequence[int], policies: str | Path) -> pd.DataF
     """
     parts = []
     for seed in seeds:
-        path = policy_path(policies, cell.label, seed, cell.updates, cell.choice)
-        players, _ = load_policy(path, NETWORK, {"seed": seed, "choice": cell.choice})
+        players = load_players(cell, seed, policies)
         for friction in cell.frictions:
             found = opened(players, friction, cell.num_doors, EVALUATION_SEED)
             parts.append(
@@ -92,16 +107,29 @@ def evaluate(cell: Cell, seeds: Sequence[int], policies: str | Path) -> pd.DataF
     return pd.concat(parts, ignore_index=True)
 
 
+def load_players(cell: Cell, seed: int, policies: str | Path) -> list[Weights]:
+    """The players of a run who act."""
+    path = policy_path(policies, cell.label, seed, cell.updates, cell.choice)
+    players, _ = load_policy(path, NETWORK, {"seed": seed, "choice": cell.choice})
+    return players if cell.player is None else [players[cell.player]]
+
+
+def door_seeds(num_doors: int = NUM_DOORS) -> list[int]:
+    """Seeds with which :class:`ipo.door.DoorEnv` makes the doors of the evaluation, one by one."""
+    streams = np.random.SeedSequence(EVALUATION_SEED).spawn(num_doors)
+    return [int(stream.generate_state(1)[0]) for stream in streams]
+
+
 def evaluation_doors(num_doors: int = NUM_DOORS) -> pd.DataFrame:
     """What the doors of the evaluation are like: a row for each, without its friction.
 
     The columns are those of :class:`ipo.door.DoorParams`, ``lever_arm``, and the handle's shift.
     """
-    doors = VectorDoor([0.0] * num_doors)
-    doors.reset(seed=EVALUATION_SEED)
-    fleet = doors.parts[0].doors
-    rows = [
-        asdict(params) | {"lever_arm": params.lever_arm, "shift_y": y, "shift_z": z}
-        for params, (y, z) in zip(fleet.params, fleet.shifts, strict=True)
-    ]
+    rows = []
+    for seed in door_seeds(num_doors):
+        env = DoorEnv(0.0)
+        env.reset(seed=seed)
+        y, z = env.handle_shift
+        lever_arm = env.params.lever_arm
+        rows.append(asdict(env.params) | {"lever_arm": lever_arm, "shift_y": y, "shift_z": z})
     return pd.DataFrame(rows).drop(columns="friction").rename_axis("door").reset_index()
