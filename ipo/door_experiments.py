@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from ipo import door_training
 from ipo.checks import check_choice, check_count
 from ipo.door import DoorEnv, DoorParams
-from ipo.door_training import CELLS, CHOICES, NETWORK, TRAIN_FRICTIONS, opened, policy_path
+from ipo.door_training import CHOICES, NETWORK, TRAIN_FRICTIONS, opened, policy_path
 from ipo.networks import Weights, load_policy
 
 MODULES = ("door_experiments",)
@@ -31,38 +32,46 @@ class Cell:
     """Policies of one method after so many updates, on so many doors.
 
     Attributes:
-        label: of a cell of :data:`ipo.door_training.CELLS`.
-        updates: after which the policy was saved.
+        trained: how they were trained.
+        updates: after which the policies were saved; one of ``trained.saved_after``.
         choice: the ``best`` policy so far, as published, or the ``last``.
         player: the number of the player who acts alone; ``None``: all players' average.
         frictions: the domains in which they are tested.
         num_doors: of each friction.
     """
 
-    label: str
-    updates: int = 190
+    trained: door_training.Cell
+    updates: int
     choice: str = "best"
     player: int | None = None
     frictions: tuple[float, ...] = TEST_FRICTIONS
     num_doors: int = NUM_DOORS
 
     def __post_init__(self) -> None:
-        check_choice("label", self.label, CELLS)
-        check_choice("choice", self.choice, CHOICES)
-        check_count("updates", self.updates)
-        check_tested(self.frictions, self.num_doors)
-        if self.player is not None and not 0 <= self.player < num_players(self.label):
+        if self.updates not in self.trained.saved_after:
             raise ValueError(
-                f"player = {self.player!r}: must be None or less than {num_players(self.label)}"
+                f"updates = {self.updates!r}: must be one of {self.trained.saved_after}, after "
+                "which policies are saved"
+            )
+        check_choice("choice", self.choice, CHOICES)
+        check_tested(self.frictions, self.num_doors)
+        if self.player is not None and not 0 <= self.player < self.num_players:
+            raise ValueError(
+                f"player = {self.player!r}: must be None or less than {self.num_players}"
             )
 
     @property
+    def num_players(self) -> int:
+        """How many networks a policy averages."""
+        return len(self.trained.settings.domains_of_players(len(TRAIN_FRICTIONS)))
+
+    @property
     def columns(self) -> dict[str, Any]:
-        settings = CELLS[self.label].settings
+        settings = self.trained.settings
         alone = "" if self.player is None else f"_player_{self.player}"
         return {
-            "method": self.label + alone,
-            "train_frictions": "+".join(map(str, TRAIN_FRICTIONS)),
+            "method": self.trained.label + alone,
+            "train_frictions": self.trained.columns["train_frictions"],
             "steps": self.updates * settings.num_steps * sum(settings.num_envs),
             "choice": self.choice,
         }
@@ -72,11 +81,6 @@ def check_tested(frictions: Sequence[float], num_doors: int) -> None:
     check_count("num_doors", num_doors)
     for friction in frictions:
         DoorParams(friction=friction)
-
-
-def num_players(label: str) -> int:
-    """How many networks a cell's policies average."""
-    return len(CELLS[label].settings.domains_of_players(len(TRAIN_FRICTIONS)))
 
 
 def evaluate(cell: Cell, seeds: Sequence[int], policies: str | Path) -> pd.DataFrame:
@@ -109,7 +113,7 @@ def evaluate(cell: Cell, seeds: Sequence[int], policies: str | Path) -> pd.DataF
 
 def load_players(cell: Cell, seed: int, policies: str | Path) -> list[Weights]:
     """The players of a run who act."""
-    path = policy_path(policies, cell.label, seed, cell.updates, cell.choice)
+    path = policy_path(policies, cell.trained.label, seed, cell.updates, cell.choice)
     players, _ = load_policy(path, NETWORK, {"seed": seed, "choice": cell.choice})
     return players if cell.player is None else [players[cell.player]]
 

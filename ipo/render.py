@@ -6,6 +6,7 @@ import base64
 import html
 import importlib
 import io
+import weakref
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -119,6 +120,8 @@ class DoorPicture:
                 "sudo apt-get install libegl1 libgl1 libgl1-mesa-dri libegl-mesa0 "
                 f"(the cause was: {error})"
             ) from error
+        # Also where nobody closes it: MuJoCo's own clean-up would free what is another picture's.
+        self.close = weakref.finalize(self, _free, self.context, self.opengl)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self.opengl)
         self.scene = mujoco.MjvScene(self.model, maxgeom=200)
         self.camera = mujoco.MjvCamera()
@@ -144,15 +147,16 @@ class DoorPicture:
         mujoco.mjr_readPixels(picture, None, self.rectangle, self.opengl)
         return picture[::-1]  # OpenGL counts lines from below
 
-    def close(self) -> None:
-        """Give the memory of OpenGL back."""
-        self.context.make_current()
-        self.opengl.free()
-        self.context.free()
-
 
 class RenderError(RuntimeError):
     """No pictures can be drawn on this machine."""
+
+
+def _free(context: Any, opengl: mujoco.MjrContext) -> None:
+    """Give the memory of OpenGL back: its numbers only mean something in their own context."""
+    context.make_current()
+    opengl.free()
+    context.free()
 
 
 def door_scene(params: DoorParams, width: int = 640, height: int = 480) -> mujoco.MjSpec:
