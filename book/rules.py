@@ -13,6 +13,8 @@ import numpy as np
 import pandas as pd
 import scipy.stats
 
+from ipo.door_strategies import strategy_of_policy
+
 CONFIGURATION = ["num_domains", "dim_distractor"]
 
 REPRODUCED = "reproduced"
@@ -50,11 +52,11 @@ class Cells:
     num_runs: int
 
     def runs(self, **where) -> pd.Series:
-        """Value of every run of a cell, indexed by run."""
+        """Value of every run of a cell, or the mean of its values, indexed by run."""
         chosen = self.rows
         for column, value in where.items():
             chosen = chosen[chosen[column] == value]
-        values = chosen.drop_duplicates("run").set_index("run")["value"].sort_index()
+        values = chosen.groupby("run")["value"].agg(lambda own: own.mean(skipna=False))
         if len(values) < self.num_runs or values.isna().any():
             cell = ", ".join(f"{column} {value}" for column, value in where.items())
             raise NoData(f"{cell}: {values.count()} of {self.num_runs} runs")
@@ -196,18 +198,26 @@ def gap_survives_plain_steps(
 # --- coloured keys --------------------------------------------------------------------------------
 
 
-def returns_come_back(cells: Cells, paper: pd.DataFrame, num_paper_runs: int) -> Finding:
+def means_come_back(
+    cells: Cells,
+    paper: pd.DataFrame,
+    metric: str,
+    num_paper_runs: int,
+    digits: int,
+    where: dict[str, dict],
+) -> Finding:
     """Every mean of the paper is as near to ours as the spread of its runs lets us expect.
 
     Within two standard errors of the difference, or within the rounding of what is printed.
+    ``where`` says which rows of a method are meant.
     """
     good, parts = [], []
     for row in paper.itertuples(index=False, name="PaperCell"):
-        ours = cells.runs(method=row.method, domain=row.domain, metric="return_published_protocol")
+        ours = cells.runs(method=row.method, domain=row.domain, metric=metric, **where[row.method])
         error = np.hypot(row.std / np.sqrt(num_paper_runs), ours.sem())
-        good.append(abs(ours.mean() - row.mean) <= max(2 * error, 0.005))
+        good.append(abs(ours.mean() - row.mean) <= max(2 * error, 0.5 * 10**-digits))
         parts.append(
-            f"{NAMES[row.method]} on {row.domain} {ours.mean():.3f} (paper {row.mean:.2f})"
+            f"{NAMES[row.method]} on {row.domain} {ours.mean():.3f} (paper {row.mean:.{digits}f})"
         )
     return Finding(all_some_none(good), "; ".join(parts))
 
@@ -244,6 +254,70 @@ def smaller_spread(
     )
     smaller = ours.std() < theirs.std() and p < 0.05
     return Finding(REPRODUCED if smaller else NOT_SUPPORTED, evidence)
+
+
+# --- door opening ---------------------------------------------------------------------------------
+
+
+def higher_success(
+    cells: Cells, paper: pd.DataFrame, domains: list[float], comparisons: dict[str, list[dict]]
+) -> Finding:
+    """The 95 % interval of the difference lies above zero, in every comparison of two arms.
+
+    Of a run, the mean over the domains counts.
+    """
+    good, parts = [], []
+    for name, arms in comparisons.items():
+        ours, theirs = (
+            sum(cells.runs(metric="success", domain=domain, **arm) for domain in domains)
+            / len(domains)
+            for arm in arms
+        )
+        low, high = scipy.stats.ttest_ind(ours, theirs, equal_var=False).confidence_interval(0.95)
+        good.append(low > 0)
+        parts.append(
+            f"{name}: {ours.mean():.3f} and {theirs.mean():.3f}, difference "
+            f"{ours.mean() - theirs.mean():+.3f}, 95 % interval [{low:+.3f}, {high:+.3f}]"
+        )
+    return Finding(all_some_none(good), "; ".join(parts))
+
+
+def strategies_come_back(
+    cells: Cells, paper: pd.DataFrame, domain: float, hooking: dict, outside: dict
+) -> Finding:
+    """All policies of one arm hook, and most of the other's pull with the outside."""
+    counts = {}
+    for role, arm in (("hook", hooking), ("outside", outside)):
+        cells.runs(metric="inside_part", domain=domain, **arm)  # complete, or no verdict
+        chosen = cells.rows[(cells.rows["metric"] == "inside_part")]
+        for column, value in (arm | {"domain": domain}).items():
+            chosen = chosen[chosen[column] == value]
+        names = chosen.groupby("run")["value"].agg(strategy_of_policy)
+        counts[role] = names.value_counts().reindex(["hook", "mixed", "outside"], fill_value=0)
+    evidence = "; ".join(
+        f"{NAMES[arm['method']]}: " + ", ".join(f"{n} {name}" for name, n in counts[role].items())
+        for role, arm in (("hook", hooking), ("outside", outside))
+    )
+    all_hook = counts["hook"]["hook"] == counts["hook"].sum()
+    most_outside = counts["outside"]["outside"] > counts["outside"].sum() / 2
+    return Finding(all_some_none([bool(all_hook), bool(most_outside)]), evidence)
+
+
+def hooks_are_robust(
+    cells: Cells, paper: pd.DataFrame, watched: float, tested: float, arms: list[dict]
+) -> Finding:
+    """Over policies, the part of the pull by the inside of the hook goes with success."""
+    part, success = (
+        pd.concat([cells.runs(metric=metric, domain=domain, **arm) for arm in arms])
+        for metric, domain in (("inside_part", watched), ("success", tested))
+    )
+    found = scipy.stats.spearmanr(part, success)
+    evidence = (
+        f"rank correlation over {len(part)} policies between the part at friction {watched} and "
+        f"success at {tested}: {found.statistic:+.2f}, p = {found.pvalue:.2f}"
+    )
+    supported = found.statistic > 0 and found.pvalue < 0.05
+    return Finding(REPRODUCED if supported else NOT_SUPPORTED, evidence)
 
 
 # --- what rules share -----------------------------------------------------------------------------
@@ -292,8 +366,11 @@ RULES = {
         significantly_lower,
         tends_to_oracle,
         gap_survives_plain_steps,
-        returns_come_back,
+        means_come_back,
         higher_return,
         smaller_spread,
+        higher_success,
+        strategies_come_back,
+        hooks_are_robust,
     )
 }

@@ -42,6 +42,7 @@ INSIDE = {
     "hook_4": (-1, 0, 0),
 }
 HOOK, OUTSIDE = 0.8, 0.2  # from which and up to which part of the impulse a strategy is named
+MOST = 2 / 3  # of its doors a policy opens in a way that is called its own
 
 
 def pulling_forces(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[float, float]:
@@ -107,9 +108,23 @@ def strategy(
         if truncated:
             return "failed", float("nan")
     part = float(impulse[0] / impulse.sum()) if impulse.any() else 0.0
+    return strategy_of_part(part), part
+
+
+def strategy_of_part(part: float) -> str:
+    """The name for an episode in which the inside of the hook did so much of the pull."""
     if part >= HOOK:
-        return "hook", part
-    return ("outside" if part <= OUTSIDE else "mixed"), part
+        return "hook"
+    return "outside" if part <= OUTSIDE else "mixed"
+
+
+def strategy_of_policy(parts: Sequence[float]) -> str:
+    """The name for a policy, from the ``parts`` of the doors that it opened."""
+    names = [strategy_of_part(part) for part in parts]
+    for name in ("hook", "outside"):
+        if names and names.count(name) >= MOST * len(names):
+            return name
+    return "mixed"
 
 
 @dataclass(frozen=True)

@@ -272,3 +272,82 @@ def test_higher_return_or_not(empty, ipo, ensemble, better, game):
 def test_smaller_spread_or_not(empty, spread, expected):
     write_keys(empty, {("ppo", "grey"): (0.8, 0.12), ("ipo", "grey"): (0.8, spread)})
     assert verdict(empty, "keys-consistent") == expected
+
+
+# ------------------------------------------------------------------------------- door opening
+
+DOOR = [
+    "method", "train_frictions", "steps", "choice", "run", "domain", "door", "metric", "value",
+]  # fmt: skip
+FULL, HALF = 24903680, 12451840
+
+
+def write_door(data: Path, name: str, cells: dict, metric: str = "success") -> None:
+    """Ten runs of every cell ``(method, steps, domain)`` with two doors each, around a mean."""
+    lines = [
+        (method, "0.0+0.1", steps, "best", run, domain, door, metric, mean + noise + move)
+        for (method, steps, domain), (mean, spread) in cells.items()
+        for run, noise in enumerate(np.linspace(-spread, spread, 10))
+        for door, move in ((0, -0.001), (1, 0.001))
+    ]
+    path = data / "results" / "door" / f"{name}.csv"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pd.DataFrame(lines, columns=DOOR).to_csv(path, index=False)
+
+
+def door_table(data: Path, change: float) -> dict:
+    """The paper's means, those of PPO changed, and IPO's for equal steps the same as PPO's."""
+    paper = pd.read_csv(data / "paper" / "door.csv").set_index(["method", "domain"])
+    cells = {}
+    for (method, domain), row in paper.iterrows():
+        mean = row["mean"] + (change if method == "ppo" else 0)
+        cells[method, FULL if method == "ppo" else HALF, domain] = (mean, 0.005)
+        if method == "ppo":
+            cells["ipo", FULL, domain] = (mean, 0.005)
+    return cells
+
+
+@pytest.mark.parametrize(
+    ("change", "numbers", "better"),
+    [
+        (0.0, claims.REPRODUCED, claims.IN_PART),
+        (0.3, claims.IN_PART, claims.NOT_SUPPORTED),
+    ],
+)
+def test_success_comes_back_or_not(empty, change, numbers, better):
+    write_door(empty, "success", door_table(empty, change))
+    assert verdict(empty, "door-numbers") == numbers
+    assert verdict(empty, "door-better") == better
+
+
+def test_better_in_both_comparisons(empty):
+    cells = door_table(empty, 0.0)
+    cells |= {
+        ("ipo", FULL, domain): (mean + 0.05, 0.005)
+        for (method, _, domain), (mean, _) in door_table(empty, 0.0).items()
+        if method == "ppo"
+    }
+    write_door(empty, "success", cells)
+    assert verdict(empty, "door-better") == claims.REPRODUCED
+
+
+@pytest.mark.parametrize(
+    ("ipo", "ppo", "expected"),
+    [
+        (0.95, 0.05, claims.REPRODUCED),
+        (0.95, 0.95, claims.IN_PART),
+        (0.50, 0.95, claims.NOT_SUPPORTED),
+    ],
+)
+def test_strategies_come_back_or_not(empty, ipo, ppo, expected):
+    cells = {("ipo", HALF, 0.1): (ipo, 0.02), ("ppo", FULL, 0.1): (ppo, 0.02)}
+    write_door(empty, "strategies", cells, "inside_part")
+    assert verdict(empty, "door-strategies") == expected
+
+
+@pytest.mark.parametrize(("sign", "expected"), [(1, claims.REPRODUCED), (-1, claims.NOT_SUPPORTED)])
+def test_hooks_are_robust_or_not(empty, sign, expected):
+    arms = (("ppo", FULL), ("ipo", HALF))
+    write_door(empty, "strategies", {(*arm, 1.3): (0.5, 0.3) for arm in arms}, metric="inside_part")
+    write_door(empty, "success", {(*arm, 1.5): (0.6, sign * 0.2) for arm in arms})
+    assert verdict(empty, "door-hooks-are-robust") == expected
