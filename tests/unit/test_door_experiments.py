@@ -2,13 +2,22 @@
 
 import numpy as np
 import pytest
+import torch
 
 from ipo import door_training
 from ipo.dense_network import DenseNetwork
 from ipo.door import DoorEnv
-from ipo.door_experiments import EVALUATION_SEED, Cell, evaluate, evaluation_doors
+from ipo.door_experiments import (
+    EVALUATION_SEED,
+    Cell,
+    door_seeds,
+    evaluate,
+    evaluation_doors,
+    load_players,
+)
 from ipo.door_training import CELLS, NETWORK, opened, policy_path, published
 from ipo.networks import save_policy
+from ipo.vector_door import VectorDoor
 
 
 @pytest.fixture
@@ -22,7 +31,7 @@ def policies(tmp_path):
 
 
 def cell(**changes) -> Cell:
-    options = {"label": "ipo", "updates": 95, "choice": "last", "frictions": (0.0, 1.5)}
+    options = {"trained": CELLS["ipo"], "updates": 95, "choice": "last", "frictions": (0.0, 1.5)}
     return Cell(**(options | {"num_doors": 3} | changes))
 
 
@@ -40,12 +49,20 @@ def test_a_row_for_every_run_friction_and_door(policies):
     assert list(fewer) == list(same)
 
 
+def test_a_player_alone(policies):
+    rows = evaluate(cell(player=1), [0], policies)
+    assert set(rows["method"]) == {"ipo_player_1"}
+    (alone,) = load_players(cell(player=1), 0, policies)
+    together = load_players(cell(), 0, policies)
+    assert all(torch.equal(alone[name], together[1][name]) for name in alone)
+
+
 def test_the_same_doors_at_every_friction(monkeypatch):
     """A hook that never moves opens nothing; the door that it meets is the one of the table."""
     table = evaluation_doors(3)
     seen = []
 
-    class Spy(door_training.VectorDoor):
+    class Spy(VectorDoor):
         def close(self, **options):
             seen.append(self.parts[0].doors.params)
             super().close(**options)
@@ -61,12 +78,16 @@ def test_the_same_doors_at_every_friction(monkeypatch):
 
 
 def test_a_door_of_the_evaluation_can_be_made_alone():
-    streams = np.random.SeedSequence(EVALUATION_SEED).spawn(2)
-    env = DoorEnv(0.0)
-    env.reset(seed=int(streams[1].generate_state(1)[0]))
-    row = evaluation_doors(2).iloc[1]
-    assert env.params.height == row["height"]
-    np.testing.assert_allclose(env.handle_shift, [row["shift_y"], row["shift_z"]])
+    """One by one they are the same as side by side, from the same starts."""
+    vector = VectorDoor([0.5] * 3)
+    observations, _ = vector.reset(seed=EVALUATION_SEED)
+    for door, seed in enumerate(door_seeds(3)):
+        env = DoorEnv(0.5)
+        observation, _ = env.reset(seed=seed)
+        np.testing.assert_array_equal(observation, observations[door])
+        row = evaluation_doors(3).iloc[door]
+        assert env.params.height == row["height"]
+        np.testing.assert_allclose(env.handle_shift, [row["shift_y"], row["shift_z"]])
 
 
 def test_the_published_settings():
@@ -81,10 +102,12 @@ def test_the_published_settings():
 @pytest.mark.parametrize(
     ("change", "error"),
     [
-        ({"label": "ipoo"}, "label = 'ipoo': .* did you mean 'ipo'"),
         ({"choice": "worst"}, "choice = 'worst': must be one of best, last"),
         ({"num_doors": 0}, "num_doors = 0: must be at least 1"),
-        ({"updates": 0}, "updates = 0: must be at least 1"),
+        ({"updates": 94}, r"updates = 94: must be one of \(95, 190\), after which"),
+        ({"player": 2}, "player = 2: must be None or less than 2"),
+        ({"player": -1}, "player = -1: must be None or less than 2"),
+        ({"trained": CELLS["ppo"], "player": 1}, "player = 1: must be None or less than 1"),
         ({"frictions": (-1.0,)}, "friction = -1.0: must be at least 0"),
     ],
 )

@@ -1,5 +1,6 @@
 """Pictures of the door, and the controller that hooks the handle."""
 
+import gc
 import subprocess
 import sys
 
@@ -27,6 +28,15 @@ def test_a_picture_shows_something_and_stays_the_same(picture):
     assert closed.shape == (120, 160, 3) and closed.dtype == np.uint8
     assert closed.std() > 20
     assert np.array_equal(picture.frame(np.zeros(7), SHIFT), closed)
+
+
+def test_a_picture_that_nobody_closes_does_no_harm_to_the_next(picture):
+    before = picture.frame(np.zeros(7), SHIFT)
+    other = DoorPicture(DoorParams(width=0.8), 160, 120)
+    other.frame(np.zeros(7), SHIFT)
+    del other
+    gc.collect()
+    assert np.array_equal(picture.frame(np.zeros(7), SHIFT), before)
 
 
 @pytest.mark.parametrize("joint", [0, 5, 6])

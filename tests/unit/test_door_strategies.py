@@ -5,9 +5,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ipo import door_experiments
 from ipo.door import DoorEnv, DoorParams
-from ipo.door_strategies import is_inside, strategy
+from ipo.door_experiments import Cell
+from ipo.door_strategies import (
+    ScriptedCell,
+    is_inside,
+    strategy,
+    strategy_of_part,
+    strategy_of_policy,
+    watch,
+)
+from ipo.door_training import CELLS, NETWORK, opened, policy_path
 from ipo.hooking import Hooking
+from ipo.networks import save_policy
 
 
 def scripted(side: str, seed: int) -> str:
@@ -49,6 +60,43 @@ def test_a_door_that_stays_closed_has_failed():
 )
 def test_sides_of_the_tubes(geom, point, inside):
     assert is_inside(geom, np.array(point)) is inside
+
+
+@pytest.mark.parametrize(
+    ("parts", "name"),
+    [
+        ([0.9, 0.8, 0.1], "hook"),  # two thirds
+        ([0.9, 0.79, 0.1], "mixed"),
+        ([0.2, 0.0, 0.9], "outside"),
+        ([0.5, 0.5, 0.5], "mixed"),
+        ([], "mixed"),
+    ],
+)
+def test_strategy_of_a_policy(parts, name):
+    assert strategy_of_policy(parts) == name
+
+
+def test_names_of_parts():
+    names = [strategy_of_part(part) for part in (0.0, 0.2, 0.21, 0.79, 0.8, 1.0)]
+    assert names == ["outside", "outside", "mixed", "mixed", "hook", "hook"]
+
+
+def test_the_controller_by_hand_hooks_the_doors_of_the_evaluation():
+    rows = watch(ScriptedCell((0.1,), 3), [0]).set_index(["door", "metric"])["value"]
+    for door in range(3):
+        assert rows[door, "success"] == 1
+        assert rows[door, "inside_part"] > 0.95
+        assert 100 < rows[door, "opened_at"] < 512
+
+
+def test_a_policy_that_is_watched_opens_the_doors_that_it_opens(tmp_path):
+    """One door after the other, with contacts looked at, or all side by side."""
+    players = [NETWORK.start([np.random.default_rng(0)])]
+    cell = Cell(CELLS["ppo"], 95, frictions=(0.0,), num_doors=4)
+    save_policy(policy_path(tmp_path, "ppo", 0, 95), players, {"seed": 0, "choice": "best"})
+    rows = watch(cell, [0], tmp_path)
+    success = rows[rows["metric"] == "success"]["value"]
+    assert list(success) == list(opened(players, 0.0, 4, door_experiments.EVALUATION_SEED))
 
 
 def test_an_unknown_side_is_refused():
