@@ -122,6 +122,7 @@ class DoorPicture:
             ) from error
         # Also where nobody closes it: MuJoCo's own clean-up would free what is another picture's.
         self.close = weakref.finalize(self, _free, self.context, self.opengl)
+        self.close.atexit = False  # then MuJoCo has closed the display already
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self.opengl)
         self.scene = mujoco.MjvScene(self.model, maxgeom=200)
         self.camera = mujoco.MjvCamera()
