@@ -37,7 +37,9 @@ def record(
     return frames
 
 
-def film_strip(rows: dict[str, Sequence[np.ndarray]], num_frames: int = 8) -> Figure:
+def film_strip(
+    rows: dict[str, Sequence[np.ndarray]], num_frames: int = 8, steps_per_frame: int = 1
+) -> Figure:
     """Evenly spaced frames of several episodes, a row each, for readers of a printed page."""
     fig, axes = plt.subplots(
         len(rows), num_frames, figsize=(1.25 * num_frames, 1.4 * len(rows)), squeeze=False
@@ -48,7 +50,7 @@ def film_strip(rows: dict[str, Sequence[np.ndarray]], num_frames: int = 8) -> Fi
             ax.axis("off")
         for ax, step in zip(line, steps, strict=False):
             ax.imshow(frames[step])
-            ax.set_title(f"step {step}", fontsize=8)
+            ax.set_title(f"step {step * steps_per_frame}", fontsize=8)
         line[0].text(
             -0.12, 0.5, title, transform=line[0].transAxes, rotation=90, ha="center", va="center"
         )
