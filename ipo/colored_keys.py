@@ -24,7 +24,7 @@ class ColoredKeysEnv(DoorKeyEnv):
 
     Args:
         size: rows and columns with the outer walls; the paper trains on 5 and draws 12.
-        color: one of :data:`COLORS`; the paper trains on red and green and tests on grey.
+        color: one of ``COLORS``; the paper trains on red and green and tests on grey.
         max_steps: horizon T; ``10 size^2`` by default, the paper's 250 for size 5. Reaching
             the goal in step t is worth ``1 - 0.9 t / T``.
         kwargs: of ``minigrid.MiniGridEnv``, such as ``render_mode="rgb_array"``.

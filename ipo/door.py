@@ -54,12 +54,15 @@ class DoorParams:
 
     Attributes:
         friction: of the hinge, in N m: the torque below which it does not move. The domain.
-        height, width, thickness: of the panel, in m.
+        height: of the panel, in m.
+        width: of the panel, in m.
+        thickness: of the panel, in m.
         handle_height: above the floor, in m.
         handle_ratio: distance from the handle to the free edge, as a part of the width.
         wall_offset: of the whole door along the wall, in m.
         density: of the panel, in kg / m^3.
-        hinge_damping, hinge_stiffness: in N m s / rad and N m / rad.
+        hinge_damping: in N m s / rad.
+        hinge_stiffness: in N m / rad.
         joint_damping: of the wrist's joints, in N s / m and N m s / rad.
         handle_diameter: of the bar, in m.
         handle_depth: distance from the door to the bar's axis, in m.
@@ -327,7 +330,7 @@ def target_position(door_angle: np.ndarray, hinge: np.ndarray, arm: np.ndarray) 
 
 
 def reward(door_angle: np.ndarray, distance: np.ndarray, R: np.ndarray) -> np.ndarray:
-    """DoorGym's reward for a state.
+    """DoorGym's reward for a state::
 
         30 |theta| - d - ln(d^2 + 0.005) - 5 - || (e_y, e_z - theta) ||
 
