@@ -51,11 +51,16 @@ class Cells:
     rows: pd.DataFrame
     num_runs: int
 
-    def runs(self, **where) -> pd.Series:
-        """Value of every run of a cell, or the mean of its values, indexed by run."""
+    def select(self, **where) -> pd.DataFrame:
+        """The rows with these values in these columns."""
         chosen = self.rows
         for column, value in where.items():
             chosen = chosen[chosen[column] == value]
+        return chosen
+
+    def runs(self, **where) -> pd.Series:
+        """Value of every run of a cell, or the mean of its values, indexed by run."""
+        chosen = self.select(**where)
         values = chosen.groupby("run")["value"].agg(lambda own: own.mean(skipna=False))
         if len(values) < self.num_runs or values.isna().any():
             cell = ", ".join(f"{column} {value}" for column, value in where.items())
@@ -288,11 +293,9 @@ def strategies_come_back(
     """All policies of one arm hook, and most of the other's pull with the outside."""
     counts = {}
     for role, arm in (("hook", hooking), ("outside", outside)):
-        cells.runs(metric="inside_part", domain=domain, **arm)  # complete, or no verdict
-        chosen = cells.rows[(cells.rows["metric"] == "inside_part")]
-        for column, value in (arm | {"domain": domain}).items():
-            chosen = chosen[chosen[column] == value]
-        names = chosen.groupby("run")["value"].agg(strategy_of_policy)
+        where = {"metric": "inside_part", "domain": domain, **arm}
+        cells.runs(**where)  # complete, or no verdict
+        names = cells.select(**where).groupby("run")["value"].agg(strategy_of_policy)
         counts[role] = names.value_counts().reindex(["hook", "mixed", "outside"], fill_value=0)
     evidence = "; ".join(
         f"{NAMES[arm['method']]}: " + ", ".join(f"{n} {name}" for name, n in counts[role].items())

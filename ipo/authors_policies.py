@@ -31,6 +31,16 @@ LAYERS = {
     "critic2": ("base.critic{d}.2",),
     "critic3": ("base.critic_linear{d}",),
 }
+# What goes wrong where a file is cut short, or holds something else.
+NOT_THEIRS = (
+    pickle.UnpicklingError,
+    EOFError,
+    RuntimeError,
+    LookupError,
+    TypeError,
+    AttributeError,
+    ValueError,
+)
 LOG_STD = ("base.logstd{d}._bias", "dist.logstd._bias")
 
 
@@ -65,13 +75,14 @@ def load_authors_policy(path: str | Path) -> list[Weights]:
         tensors = _tensors(saved[0])
         players = ("1", "2") if any("actor2" in name for name in tensors) else ("",)
         return [_player(tensors, d) for d in players]
-    except (pickle.UnpicklingError, EOFError, RuntimeError, LookupError, TypeError) as error:
+    except NOT_THEIRS as error:
         raise ValueError(f"{path}: cannot be read as a policy of the authors: {error}") from error
 
 
 def _player(tensors: dict[str, Tensor], d: str) -> Weights:
     def tensor(*names: str) -> Tensor:
-        return next(tensors[n] for name in names if (n := name.format(d=d)) in tensors)
+        wanted = [name.format(d=d) for name in names]
+        return tensors[next((name for name in wanted if name in tensors), wanted[0])]
 
     weights = {"log_std": tensor(*LOG_STD).reshape(1, -1)}
     for layer, names in LAYERS.items():

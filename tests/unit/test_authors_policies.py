@@ -135,12 +135,17 @@ def test_no_repository_there(tmp_path):
         authors_policies(tmp_path)
 
 
-@pytest.mark.parametrize("damage", ["cut short", "not a pickle", "something else", "too small"])
+@pytest.mark.parametrize(
+    "damage",
+    ["cut short", "not a pickle", "something else", "numbers", "too small", "a layer less"],
+)
 def test_a_file_that_is_no_policy_is_refused(tmp_path, foreign, damage):
     path = tmp_path / "policy.pt"
     policy = foreign("ppo")
     if damage == "too small":
         policy.base.actor = layers(15, 8, 64)
+    elif damage == "a layer less":
+        del policy.base.critic_linear
     torch.save([policy, None], path)
     if damage == "cut short":
         path.write_bytes(path.read_bytes()[:2000])
@@ -148,5 +153,7 @@ def test_a_file_that_is_no_policy_is_refused(tmp_path, foreign, damage):
         path.write_text("not a pickle")
     elif damage == "something else":
         path.write_bytes(pickle.dumps({"weights": [1, 2, 3]}))
-    with pytest.raises(ValueError, match=r"cannot be read as a policy of the authors|has shape"):
+    elif damage == "numbers":
+        torch.save([1, 2], path)
+    with pytest.raises(ValueError, match=r"policy.pt: cannot be read as a policy of the authors"):
         load_authors_policy(path)

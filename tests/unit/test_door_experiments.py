@@ -15,7 +15,7 @@ from ipo.door_experiments import (
     evaluation_doors,
     load_players,
 )
-from ipo.door_training import CELLS, NETWORK, opened, policy_path, published
+from ipo.door_training import CELLS, NETWORK, make_doors, opened, policy_path, published
 from ipo.networks import save_policy
 from ipo.vector_door import VectorDoor
 
@@ -88,6 +88,17 @@ def test_a_door_of_the_evaluation_can_be_made_alone():
         row = evaluation_doors(3).iloc[door]
         assert env.params.height == row["height"]
         np.testing.assert_allclose(env.handle_shift, [row["shift_y"], row["shift_z"]])
+
+
+def test_runs_of_the_same_seed_have_the_same_doors_without_friction():
+    """Whether one player owns all doors, or each player those of one friction."""
+
+    def first_doors(domains, copies):
+        doors = make_doors(domains, copies, [np.random.default_rng(3)])
+        doors.reset()
+        return doors.envs.parts[0].doors.params[:4]
+
+    assert first_doors([0, 1], [4, 2]) == first_doors([0], [4])
 
 
 def test_the_published_settings():
