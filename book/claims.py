@@ -11,6 +11,7 @@ from pathlib import Path
 import pandas as pd
 import yaml
 
+from experiments.store import Store
 from rules import IN_PART, NO_DATA, NOT_SUPPORTED, REPRODUCED, RULES, Cells, Finding, NoData
 
 DATA = Path(__file__).resolve().parent.parent / "data"
@@ -27,11 +28,12 @@ def load_cells(results: list[str], chapter: dict, data: Path = DATA) -> Cells:
     columns = [*ROW_COLUMNS, *chapter["columns"]]
     frames = []
     for name in results:
-        path = data / "results" / f"{name}.csv"
-        if path.exists():
-            frames.append(pd.read_csv(path))
-            if missing := set(columns) - set(frames[-1].columns):
-                raise ValueError(f"{path}: no column {sorted(missing)}")
+        chosen, _, file = name.partition("/")
+        rows = Store(data / "results" / chosen, file).rows()
+        if len(rows):
+            frames.append(rows)
+            if missing := set(columns) - set(rows.columns):
+                raise ValueError(f"{name}: no column {sorted(missing)}")
     rows = pd.concat(frames) if frames else pd.DataFrame(columns=columns)
     return Cells(rows, chapter["num_runs"])
 

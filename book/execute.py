@@ -29,7 +29,7 @@ from IPython.core.inputtransformer2 import TransformerManager
 from nbformat import NotebookNode
 from tqdm import tqdm
 
-from ipo import provenance
+import sources
 
 WORKER = "import json, sys, papermill; papermill.execute_notebook(**json.loads(sys.argv[1]))"
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -157,7 +157,7 @@ def fingerprint(notebook: Notebook) -> str:
     everything = {
         "code": code,
         "parameters": notebook.parameters,
-        "modules": provenance.source_hash(provenance.imported_modules(python)),
+        "modules": sources.source_hash(sources.imported_modules(python)),
         "data": {str(folder.relative_to(notebook.root)): tree_hash(folder) for folder in folders},
         "packages": (notebook.root / "environment.txt").read_text(encoding="utf-8"),
     }

@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 import scipy.stats
 
-from ipo.door_strategies import strategy_of_policy
+from ipo.worlds.pulling import strategy_of_policy
 
 CONFIGURATION = ["num_domains", "dim_distractor"]
 

@@ -57,14 +57,15 @@ def install_environment():
     run(sys.executable, "-m", "venv", VENV)
     pip = [VENV / "bin" / "python", "-m", "pip", "--disable-pip-version-check", "install", "-qq"]
     run(*pip, "--requirement", ROOT / "environment.txt")
-    run(*pip, "--no-deps", "--no-build-isolation", "--editable", ROOT)
+    for package in (ROOT, ROOT / "notebooks"):  # ipo, and the experiments
+        run(*pip, "--no-deps", "--no-build-isolation", "--editable", package)
     STAMP.write_text(wanted)
 
 
 def environment_key():
     """Hash of all that the environment depends on; a moved folder needs new absolute paths."""
     key = hashlib.sha256(f"{sys.version} {ROOT}".encode())
-    for name in ("environment.txt", "pyproject.toml"):
+    for name in ("environment.txt", "pyproject.toml", "notebooks/pyproject.toml"):
         key.update((ROOT / name).read_bytes())
     return key.hexdigest()
 

@@ -1,4 +1,7 @@
-"""Which code a result depends on: a hash of ``ipo`` modules, comments and docstrings aside."""
+"""Which code an executed notebook depends on: a hash of our modules, comments and docstrings aside.
+
+It decides whether a notebook is executed again, and nothing about results.
+"""
 
 from __future__ import annotations
 
@@ -9,32 +12,36 @@ import tokenize
 from collections.abc import Iterable
 from pathlib import Path
 
-PACKAGE = Path(__file__).parent
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGES = {"ipo": ROOT / "ipo", "experiments": ROOT / "notebooks" / "experiments"}
+
+
+def module_path(name: str) -> Path | None:
+    """The file of one of our modules, such as ``ipo.worlds.door``; None for other modules."""
+    package, *parts = name.split(".")
+    if package not in PACKAGES:
+        return None
+    path = PACKAGES[package].joinpath(*parts)
+    return next((p for p in (path.with_suffix(".py"), path / "__init__.py") if p.is_file()), None)
 
 
 def imported_modules(source: str) -> set[str]:
-    """Names of the ``ipo`` modules that a piece of code imports directly, such as ``"lqr"``."""
+    """Names of our modules that a piece of code imports, wherever in it."""
     names = set()
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
-            names |= {a.name.split(".")[1] for a in node.names if a.name.startswith("ipo.")}
-        elif isinstance(node, ast.ImportFrom) and node.module == "ipo":
             names |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and (node.module or "").startswith("ipo."):
-            names.add(node.module.split(".")[1])
-    return {name for name in names if (PACKAGE / f"{name}.py").exists()}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+    return {name for name in names if module_path(name)}
 
 
 def source_hash(modules: Iterable[str]) -> str:
-    """Hash of the named ``ipo`` modules and of every ``ipo`` module that they import.
-
-    Comments, docstrings and blank lines do not count, so that a result does not become
-    stale because its code was explained better.
-    """
+    """Hash of the named modules of ours and of all that they import."""
     pending, seen = set(modules), {}
     while pending:
         name = pending.pop()
-        source = (PACKAGE / f"{name}.py").read_text(encoding="utf-8")
+        source = module_path(name).read_text(encoding="utf-8")
         seen[name] = _code_only(source)
         pending |= imported_modules(source) - seen.keys()
     text = "\n".join(f"# {name}\n{seen[name]}" for name in sorted(seen))

@@ -57,7 +57,6 @@ def run_jupyter_book(source: Path, output: Path) -> Path:
     done = subprocess.run(
         [*command, *strict],
         cwd=source,
-        env=os.environ | {"PYTHONPATH": str(source / "_ext")},
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,

@@ -8,5 +8,5 @@ from gymnasium import register
 
 __version__ = "0.1.0"
 
-register("ipo/ColoredKeys-v0", entry_point="ipo.colored_keys:ColoredKeysEnv")
-register("ipo/Door-v0", entry_point="ipo.door:DoorEnv")
+register("ipo/ColoredKeys-v0", entry_point="ipo.worlds.colored_keys:ColoredKeysEnv")
+register("ipo/Door-v0", entry_point="ipo.worlds.door:DoorEnv")

@@ -11,9 +11,9 @@ import pytest
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
 
 import claims
+import sources as provenance
 from build import main
 from execute import load_notebooks, tree_hash
-from ipo import provenance
 
 PROFILES = {
     "class": "plain: {num_runs: 3}\n",

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from ipo.causality.vector_game import Cost
 from ipo.checks import check_number
-from ipo.vector_game import Cost
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ import torch
 from scipy.optimize import minimize_scalar
 from torch import Tensor
 
-from ipo.vector_game import Cost
+from ipo.causality.vector_game import Cost
 
 DECAY = 0.99
 NOISE_1, NOISE_2 = 1.0, 0.1

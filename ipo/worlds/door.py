@@ -464,12 +464,12 @@ class DoorEnv(gym.Env):
         return observation, float(earned), False, truncated, self._info()
 
     def render(self) -> np.ndarray | None:
-        """A picture of the present state; needs EGL, see :mod:`ipo.render`."""
+        """A picture of the present state; needs EGL, see :mod:`experiments.pictures`."""
         if self.render_mode is None:
             return None
         if self._picture is None:
             # By name: how a door looks is no part of what results depend on.
-            render = importlib.import_module("ipo.render")
+            render = importlib.import_module("experiments.pictures")
             self._picture = render.DoorPicture(self.params)
         return self._picture.frame(self.data.qpos, self.handle_shift)
 

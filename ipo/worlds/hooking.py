@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from ipo.checks import check_choice
-from ipo.door import ANCHOR, GEAR, WRIST, DoorParams, hook_rotation, lever
+from ipo.worlds.door import ANCHOR, GEAR, WRIST, DoorParams, hook_rotation, lever
 
 # Where the handle's bar is wanted, in the wrist's frame, one place after the other. ``inside``: in
 # front of the hook and beside it, level with its mouth, which opens towards -y, then in the mouth.

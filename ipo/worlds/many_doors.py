@@ -19,7 +19,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 
 from ipo.checks import check_count, check_number
-from ipo.door import (
+from ipo.worlds.door import (
     MAX_STEPS,
     OPENED,
     TIMESTEP,
@@ -68,7 +68,7 @@ class Doors:
     Args:
         arrays: where actions are found and results go.
         doors: frictions, or parameters.
-        max_steps, timestep: see :class:`ipo.door.DoorEnv`.
+        max_steps, timestep: see :class:`ipo.worlds.door.DoorEnv`.
         first: number of the first door, for messages.
     """
 
@@ -195,7 +195,7 @@ class VectorDoor(gym.vector.VectorEnv):
         doors: for each door its friction, then the door is drawn from its seed; or its parameters.
         num_workers: processes beside this one that simulate; 0: none. In a script, more than 0
             needs the usual ``if __name__ == "__main__":``.
-        max_steps, timestep: see :class:`ipo.door.DoorEnv`.
+        max_steps, timestep: see :class:`ipo.worlds.door.DoorEnv`.
 
     Raises:
         TypeError, ValueError: no doors, more workers than doors, a friction or a number that makes

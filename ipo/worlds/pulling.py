@@ -7,30 +7,11 @@ the robot does to the handle in the direction of opening, which part does the in
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
 import mujoco
 import numpy as np
-import pandas as pd
-import torch
 
-from ipo.distributions import Gaussian
-from ipo.door import FINGER, TUBES, DoorEnv
-from ipo.door_experiments import (
-    NUM_DOORS,
-    TEST_FRICTIONS,
-    Cell,
-    check_tested,
-    door_seeds,
-    load_players,
-)
-from ipo.door_training import NETWORK
-from ipo.hooking import Hooking
-from ipo.networks import Weights
-
-MODULES = ("door_strategies",)
+from ipo.worlds.door import FINGER, TUBES, DoorEnv
 
 # Where the inside of the hook lies, seen from a tube's axis, in the wrist's frame. The hook hangs
 # on the wrist, which is at +x, and its mouth is at -y.
@@ -125,71 +106,3 @@ def strategy_of_policy(parts: Sequence[float]) -> str:
         if names and names.count(name) >= MOST * len(names):
             return name
     return "mixed"
-
-
-@dataclass(frozen=True)
-class ScriptedCell:
-    """The controller by hand, :class:`ipo.hooking.Hooking`, which knows the door it is at."""
-
-    frictions: tuple[float, ...] = TEST_FRICTIONS
-    num_doors: int = NUM_DOORS
-
-    def __post_init__(self) -> None:
-        check_tested(self.frictions, self.num_doors)
-
-    @property
-    def columns(self) -> dict[str, Any]:
-        return {"method": "hooking", "train_frictions": "none", "steps": 0, "choice": "last"}
-
-
-def watch(
-    cell: Cell | ScriptedCell, seeds: Sequence[int], policies: str | Path | None = None
-) -> pd.DataFrame:
-    """How doors are opened: rows like those of :func:`evaluate`, one door after the other.
-
-    Metrics: ``success``; and for doors that were opened ``inside_part``, the part of the pulling
-    impulse that the inside of the hook had (:func:`ipo.door_strategies.strategy`), and
-    ``opened_at``, the number of steps that it took.
-    """
-    rows = []
-    for seed in seeds:
-        players = load_players(cell, seed, policies) if isinstance(cell, Cell) else None
-        for friction in cell.frictions:
-            env = DoorEnv(friction)
-            for door, door_seed in enumerate(door_seeds(cell.num_doors)):
-                observation, _ = env.reset(seed=door_seed)
-                act = most_likely(players) if players else scripted(env)
-                name, part = strategy(env, act, observation)
-                found = {"success": float(name != "failed")}
-                if found["success"]:
-                    found |= {"inside_part": part, "opened_at": env.step_count}
-                rows += [
-                    {
-                        **cell.columns,
-                        "run": seed,
-                        "domain": str(friction),
-                        "door": door,
-                        "metric": metric,
-                        "value": float(value),
-                    }
-                    for metric, value in found.items()
-                ]
-    return pd.DataFrame(rows)
-
-
-def most_likely(players: Sequence[Weights]) -> Callable[[np.ndarray], np.ndarray]:
-    """The players' average as a function from an observation ``[15]`` to an action ``[6]``."""
-    policy = NETWORK.frozen(players)
-
-    def act(observation: np.ndarray) -> np.ndarray:
-        row = torch.tensor(observation, dtype=torch.float32)[None, None]
-        return Gaussian.mode(policy(row)[0])[0, 0].numpy()
-
-    return act
-
-
-def scripted(env: DoorEnv) -> Callable[[np.ndarray], np.ndarray]:
-    """The controller by hand for the episode that has just begun."""
-    hooking = Hooking()
-    hooking.begin(env.params, env.handle_shift)
-    return lambda _: hooking(env.data.qpos, env.data.qvel)

@@ -7,22 +7,17 @@ writes down what MiniGrid does there. Everything else is look-up in that table.
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
-from importlib.metadata import version
-from pathlib import Path
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import torch
-from filelock import FileLock
 from gymnasium import Env
 from minigrid.minigrid_env import MiniGridEnv
 from torch import Tensor
 from tqdm import tqdm
 
-from ipo.provenance import source_hash
 from ipo.rollouts import Step
 
 
@@ -137,27 +132,6 @@ def state_of(task: TabularTask, env: Env) -> int:
     if len(found) != 1:
         raise ValueError(f"env = {env}: is in no state of this table")
     return int(found[0])
-
-
-def load_or_tabulate(make_env: Callable[..., Env], folder: str | Path, **options) -> TabularTask:
-    """:func:`tabulate` ``make_env(**options)``, or the same table from a file made before.
-
-    The name of the file holds a hash of all that decides its content.
-    """
-    package, _, module = make_env.__module__.rpartition(".")
-    own = ["tabular", module] if package == "ipo" else ["tabular"]
-    made_by = f"{make_env.__module__}.{make_env.__qualname__}"
-    origin = [made_by, options, version("minigrid"), source_hash(own)]
-    digest = hashlib.sha256(json.dumps(origin, sort_keys=True).encode()).hexdigest()[:16]
-    path = Path(folder) / f"{digest}.npz"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with FileLock(path.with_suffix(".lock")):  # others that want the same table wait for it
-        if not path.exists():
-            partial = path.with_suffix(".partial.npz")
-            np.savez_compressed(partial, **vars(tabulate(make_env(**options))))
-            partial.replace(path)
-    with np.load(path) as arrays:
-        return TabularTask(**{field.name: arrays[field.name] for field in fields(TabularTask)})
 
 
 class TabularDomains:

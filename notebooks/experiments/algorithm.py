@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,12 +11,14 @@ import pandas as pd
 import torch
 from torch import Tensor
 
+from experiments import players
+from experiments.experiment import Experiment
+from experiments.rows import tidy
+from ipo.causality.scalar_control import costs
+from ipo.causality.vector_game import Settings, last, residual
 from ipo.checks import check_choice
 from ipo.game import average
-from ipo.scalar_control import costs
-from ipo.vector_game import Settings, last, residual
 
-MODULES = ("scalar_experiments",)
 FAMILIES = ("given", "grid", "random")
 GRID = np.linspace(-1, 1, 21)
 START = (0.3, 0.0)
@@ -107,7 +109,7 @@ def run_cell(cell: Cell, seeds: list[int]) -> pd.DataFrame:
         ("all", "largest_weight"): players.abs().flatten(1).amax(1),
         ("train", "residual"): residual(training, players, cell.settings.bound),
     }
-    return _rows(cell, seeds, metrics)
+    return tidy(cell, seeds, metrics)
 
 
 def gains_of(rows: pd.DataFrame) -> Tensor:
@@ -116,9 +118,15 @@ def gains_of(rows: pd.DataFrame) -> Tensor:
     return torch.tensor(wide[["k_1", "k_2"]].to_numpy())
 
 
-def _rows(cell: Cell, seeds: Sequence[int], metrics: dict[tuple[str, str], Tensor]) -> pd.DataFrame:
-    return pd.DataFrame(
-        {**cell.columns, "run": seed, "domain": domain, "metric": metric, "value": float(value)}
-        for (domain, metric), values in metrics.items()
-        for seed, value in zip(seeds, values, strict=True)
-    )
+def short(cell: Cell) -> Cell:
+    """Thirty rounds."""
+    return replace(cell, settings=replace(cell.settings, num_rounds=30))
+
+
+EXPERIMENTS = {
+    "table": Experiment(run_cell, Cell, short, (0,)),
+    "starts": Experiment(run_cell, Cell, short, (0,)),
+    "players": players.EXPERIMENT,
+} | {
+    name: Experiment(run_cell, Cell, short, (0, 1, 200)) for name in ("grid", "random", "ablation")
+}

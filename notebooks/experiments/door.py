@@ -6,25 +6,34 @@ paired; the first n of them are the same however many there are.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
+import torch
 
-from ipo import door_training
+from experiments import door_players, door_training
+from experiments.door_training import (
+    CHOICES,
+    EVALUATION_SEED,
+    NETWORK,
+    TRAIN_FRICTIONS,
+    opened,
+    policy_path,
+)
+from experiments.experiment import Experiment
 from ipo.checks import check_choice, check_count
-from ipo.door import DoorEnv, DoorParams
-from ipo.door_training import CHOICES, NETWORK, TRAIN_FRICTIONS, opened, policy_path
+from ipo.distributions import Gaussian
 from ipo.networks import Weights, load_policy
+from ipo.worlds.door import DoorEnv, DoorParams
+from ipo.worlds.hooking import Hooking
+from ipo.worlds.pulling import strategy
 
-MODULES = ("door_experiments",)
 TEST_FRICTIONS = (1.1, 1.2, 1.3, 1.4, 1.5)  # of the paper's Table 4
-MORE_FRICTIONS = (0.0, 0.1, 0.5, 2.0, 3.0)
 NUM_DOORS = 200
-EVALUATION_SEED = 20210607
 
 
 @dataclass(frozen=True)
@@ -119,7 +128,7 @@ def load_players(cell: Cell, seed: int, policies: str | Path) -> list[Weights]:
 
 
 def door_seeds(num_doors: int = NUM_DOORS) -> list[int]:
-    """Seeds with which :class:`ipo.door.DoorEnv` makes the doors of the evaluation, one by one."""
+    """Seeds with which ``DoorEnv`` makes the doors of the evaluation, one by one."""
     streams = np.random.SeedSequence(EVALUATION_SEED).spawn(num_doors)
     return [int(stream.generate_state(1)[0]) for stream in streams]
 
@@ -127,7 +136,7 @@ def door_seeds(num_doors: int = NUM_DOORS) -> list[int]:
 def evaluation_doors(num_doors: int = NUM_DOORS) -> pd.DataFrame:
     """What the doors of the evaluation are like: a row for each, without its friction.
 
-    The columns are those of :class:`ipo.door.DoorParams`, ``lever_arm``, and the handle's shift.
+    The columns are those of ``DoorParams``, ``lever_arm``, and the handle's shift.
     """
     rows = []
     for seed in door_seeds(num_doors):
@@ -137,3 +146,91 @@ def evaluation_doors(num_doors: int = NUM_DOORS) -> pd.DataFrame:
         lever_arm = env.params.lever_arm
         rows.append(asdict(env.params) | {"lever_arm": lever_arm, "shift_y": y, "shift_z": z})
     return pd.DataFrame(rows).drop(columns="friction").rename_axis("door").reset_index()
+
+
+@dataclass(frozen=True)
+class ScriptedCell:
+    """The controller by hand, ``Hooking``, which knows the door it is at."""
+
+    frictions: tuple[float, ...] = TEST_FRICTIONS
+    num_doors: int = NUM_DOORS
+
+    def __post_init__(self) -> None:
+        check_tested(self.frictions, self.num_doors)
+
+    @property
+    def columns(self) -> dict[str, Any]:
+        return {"method": "hooking", "train_frictions": "none", "steps": 0, "choice": "last"}
+
+
+def watch(
+    cell: Cell | ScriptedCell, seeds: Sequence[int], policies: str | Path | None = None
+) -> pd.DataFrame:
+    """How doors are opened: rows like those of :func:`evaluate`, one door after the other.
+
+    Metrics: ``success``; and for doors that were opened ``inside_part``, the part of the pulling
+    impulse that the inside of the hook had (:func:`ipo.worlds.pulling.strategy`), and
+    ``opened_at``, the number of steps that it took.
+    """
+    rows = []
+    for seed in seeds:
+        players = load_players(cell, seed, policies) if isinstance(cell, Cell) else None
+        for friction in cell.frictions:
+            env = DoorEnv(friction)
+            for door, door_seed in enumerate(door_seeds(cell.num_doors)):
+                observation, _ = env.reset(seed=door_seed)
+                act = most_likely(players) if players else scripted(env)
+                name, part = strategy(env, act, observation)
+                found = {"success": float(name != "failed")}
+                if found["success"]:
+                    found |= {"inside_part": part, "opened_at": env.step_count}
+                rows += [
+                    {
+                        **cell.columns,
+                        "run": seed,
+                        "domain": str(friction),
+                        "door": door,
+                        "metric": metric,
+                        "value": float(value),
+                    }
+                    for metric, value in found.items()
+                ]
+    return pd.DataFrame(rows)
+
+
+def most_likely(players: Sequence[Weights]) -> Callable[[np.ndarray], np.ndarray]:
+    """The players' average as a function from an observation ``[15]`` to an action ``[6]``."""
+    policy = NETWORK.frozen(players)
+
+    def act(observation: np.ndarray) -> np.ndarray:
+        row = torch.tensor(observation, dtype=torch.float32)[None, None]
+        return Gaussian.mode(policy(row)[0])[0, 0].numpy()
+
+    return act
+
+
+def scripted(env: DoorEnv) -> Callable[[np.ndarray], np.ndarray]:
+    """The controller by hand for the episode that has just begun."""
+    hooking = Hooking()
+    hooking.begin(env.params, env.handle_shift)
+    return lambda _: hooking(env.data.qpos, env.data.qvel)
+
+
+def short(cell: Cell | ScriptedCell) -> Cell | ScriptedCell:
+    """Ten doors at two frictions."""
+    return replace(cell, frictions=(0.1, 1.3), num_doors=10)
+
+
+def reads(cell: Cell, seed: int, policies: str | Path) -> list[Path]:
+    return [policy_path(policies, cell.trained.label, seed, cell.updates, cell.choice)]
+
+
+EXPERIMENTS = {
+    "curves": door_training.EXPERIMENT,
+    "strategies": Experiment(watch, Cell, short, (0,), reads, runs_at_once=1),
+    "scripted": Experiment(watch, ScriptedCell, short, (0,), runs_at_once=1),
+    "gaps": door_players.EXPERIMENT,
+} | {
+    name: Experiment(evaluate, Cell, short, (0,), reads, runs_at_once=1)
+    for name in ("success", "last", "alone")
+}

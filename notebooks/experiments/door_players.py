@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,17 +12,22 @@ import pandas as pd
 import torch
 from tqdm import tqdm
 
-from ipo import door_training
+from experiments import door_training
+from experiments.door_training import (
+    EVALUATION_SEED,
+    NETWORK,
+    TRAIN_FRICTIONS,
+    copied,
+    make_doors,
+    policy_path,
+)
+from experiments.experiment import Experiment
 from ipo.checks import check_count
 from ipo.distributions import Gaussian
-from ipo.door_experiments import EVALUATION_SEED
-from ipo.door_training import NETWORK, TRAIN_FRICTIONS, copied, make_doors, policy_path
 from ipo.networks import Weights, load_policy
 from ipo.ppo import Training, improve
 from ipo.rollouts import collect
-from ipo.vector_door import VectorDoor
-
-MODULES = ("door_players",)
+from ipo.worlds.many_doors import VectorDoor
 
 
 @dataclass(frozen=True)
@@ -124,3 +129,16 @@ def mean_return(players: Sequence[Weights], friction: float, num_doors: int) -> 
         observations, _, _, truncated, info = doors.step(actions.numpy())
         if truncated.all():
             return float(np.mean(info["episode_return"]))
+
+
+def short(cell: Cell) -> Cell:
+    """One update of every player on short rollouts, ten doors."""
+    trained = replace(cell.trained, settings=door_training.shorter(cell.trained.settings))
+    return replace(cell, trained=trained, num_alone=1, num_doors=10)
+
+
+def reads(cell: Cell, seed: int, policies: str | Path) -> list[Path]:
+    return [policy_path(policies, cell.trained.label, seed, cell.updates, "last")]
+
+
+EXPERIMENT = Experiment(gains_alone, Cell, short, (0,), reads, runs_at_once=1)

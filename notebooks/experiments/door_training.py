@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -17,21 +17,21 @@ import pandas as pd
 import torch
 from tqdm import tqdm
 
-from ipo.checkpoints import CheckpointError, load_checkpoint, save_checkpoint
+from experiments.checkpoints import CheckpointError, load_checkpoint, save_checkpoint
+from experiments.experiment import Experiment
 from ipo.dense_network import DenseNetwork
 from ipo.distributions import Gaussian
 from ipo.networks import Weights, save_policy
 from ipo.ppo import Settings, Training
-from ipo.provenance import source_hash
-from ipo.vector_door import VectorDoor
 from ipo.vector_environments import FromGymnasium
+from ipo.worlds.many_doors import VectorDoor
 
-MODULES = ("door_training",)
 TRAIN_FRICTIONS = (0.0, 0.1)
 NETWORK = DenseNetwork(15, 6, Gaussian)
 NUM_LAST = 10  # training episodes whose mean return decides which policy is the best
 CURVE_FRICTION, NUM_CURVE_DOORS, CURVE_SEED = 1.3, 50, 20201106
 CHOICES = ("best", "last")
+EVALUATION_SEED = 20210607  # of the doors that all policies are tested on
 
 
 def published(method: str, **changes: Any) -> Settings:
@@ -116,7 +116,7 @@ def train_run(
         the same fresh doors: ``success_most_likely``; ``cpu_seconds``.
 
     Raises:
-        CheckpointError: a check-point of other code or settings, or one that cannot be written.
+        CheckpointError: a check-point of other settings, or one that cannot be written.
     """
     (seed,) = seeds
     run = Run(cell, seed, Path(checkpoints), Path(policies))
@@ -154,7 +154,6 @@ class Run:
         self.identity = {
             "settings": listed(asdict(cell)),
             "seed": seed,
-            "source": source_hash(MODULES),
         }
         state = load_checkpoint(self.checkpoint)
         if state is not None:
@@ -245,7 +244,7 @@ class Run:
     def _restore(self, state: dict[str, Any]) -> None:
         if state["identity"] != self.identity:
             raise CheckpointError(
-                f"{self.checkpoint}: was made by other code or settings; delete it to begin anew"
+                f"{self.checkpoint}: was made with other settings; delete it to begin anew"
             )
         self.training.restore(state["training"])
         for name in ("num_updates", "cpu_seconds", "best_return", "best", "curve"):
@@ -267,7 +266,7 @@ def opened(
     """Which of ``num_doors`` fresh doors the players' average opens, by its most likely actions.
 
     The doors and the starts are those of the seed, whoever is asked and at every friction.
-    ``options`` are those of :class:`ipo.vector_door.VectorDoor`.
+    ``options`` are those of :class:`ipo.worlds.many_doors.VectorDoor`.
     """
     doors = VectorDoor([friction] * num_doors, **options)
     try:
@@ -299,3 +298,17 @@ def listed(tree: Any) -> Any:
     if isinstance(tree, dict):
         return {key: listed(part) for key, part in tree.items()}
     return [listed(part) for part in tree] if isinstance(tree, list | tuple) else tree
+
+
+def shorter(settings: Settings) -> Settings:
+    """The same with short rollouts and as many frames in a minibatch."""
+    return replace(settings, num_steps=512, num_minibatches=32)
+
+
+def short(cell: Cell) -> Cell:
+    """One update on short rollouts."""
+    settings = replace(shorter(cell.settings), num_updates=1)
+    return replace(cell, settings=settings, saved_after=(1,), curve_every=1)
+
+
+EXPERIMENT = Experiment(train_run, Cell, short, (0,), runs_at_once=1)

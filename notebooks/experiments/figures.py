@@ -12,8 +12,8 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from ipo.causality.scm import SCM
 from ipo.networks import Network
-from ipo.scm import SCM
 from ipo.stats import bootstrap_interval
 
 # Colours of Okabe and Ito, which colour-blind readers can tell apart; markers for print.

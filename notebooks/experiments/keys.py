@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,14 +12,23 @@ import pandas as pd
 import torch
 from minigrid.core.constants import OBJECT_TO_IDX
 
+from experiments.experiment import Experiment
+from experiments.rows import tidy
+from experiments.tabulated import load_or_tabulate
 from ipo.checks import check_choice
-from ipo.colored_keys import COLORS, ColoredKeysEnv
 from ipo.distributions import Categorical
 from ipo.networks import GridNetwork, OnTable, Weights, save_policy
 from ipo.ppo import Settings, train
-from ipo.tabular import TabularDomains, TabularTask, expected_return, load_or_tabulate, reach
+from ipo.worlds.colored_keys import COLORS, ColoredKeysEnv
+from ipo.worlds.tabular import (
+    TabularDomains,
+    TabularTask,
+    expected_return,
+    optimal_policy,
+    reach,
+    tabulate,
+)
 
-MODULES = ("keys_experiments",)
 ENCODINGS = ("integer", "one_hot", "none")
 COLOR_CHANNEL = 1
 NUM_COPIES, NUM_EPISODES = 50, 100  # of the published evaluation
@@ -83,7 +92,7 @@ def run_cell(
         first = [{name: w[:NUM_SAVED] for name, w in player.items()} for player in players]
         about = {"cell": cell.name, "seeds": seeds[:NUM_SAVED]}
         save_policy(Path(policies) / f"{cell.name}.safetensors", first, about)
-    return _rows(cell, seeds, evaluate(task, players, seeds))
+    return tidy(cell, seeds, evaluate(task, players, seeds))
 
 
 def run_curve(cell: Cell, seeds: list[int], tables: str | Path) -> pd.DataFrame:
@@ -91,9 +100,7 @@ def run_curve(cell: Cell, seeds: list[int], tables: str | Path) -> pd.DataFrame:
     task = Keys(tables, cell.color_encoding, cell.size)
     parts = []
     for frames, players in task.train(cell, seeds):
-        rows = _rows(cell, seeds, exact(task, players))
-        rows.insert(len(cell.columns), "frames", frames)
-        parts.append(rows)
+        parts.append(tidy(cell, seeds, exact(task, players), frames=frames))
     return pd.concat(parts, ignore_index=True)
 
 
@@ -203,9 +210,40 @@ def recolor(images: np.ndarray, codes: dict[str, int]) -> np.ndarray:
     return images
 
 
-def _rows(cell: Cell, seeds: list[int], metrics: dict[tuple[str, str], np.ndarray]) -> pd.DataFrame:
-    return pd.DataFrame(
-        {**cell.columns, "run": seed, "domain": domain, "metric": metric, "value": float(value)}
-        for (domain, metric), values in metrics.items()
-        for seed, value in zip(seeds, values, strict=True)
-    )
+@dataclass(frozen=True)
+class Grid:
+    """A grid whose table is made and measured."""
+
+    size: int
+
+    @property
+    def columns(self) -> dict[str, Any]:
+        return {"size": self.size}
+
+
+def run_grid(grid: Grid, seeds: list[int]) -> pd.DataFrame:
+    """How large the table of a grid is; nothing about it is random."""
+    task = tabulate(ColoredKeysEnv(size=grid.size), max_states=1_000_000)
+    counts = {
+        "layouts": (task.start > 0).sum(),
+        "states": len(task.start),
+        "distinct observations": len(task.images),
+        "optimal return": optimal_policy(task)[1],
+    }
+    return tidy(grid, seeds, {("grey", name): [count] for name, count in counts.items()})
+
+
+def short(cell: Cell) -> Cell | None:
+    """Two updates. The tables of larger grids take minutes, and are of no other kind."""
+    if cell.size != 5:
+        return None
+    return replace(cell, settings=replace(cell.settings, num_updates=2))
+
+
+EXPERIMENTS = {
+    name: Experiment(run_cell, Cell, short, runs_at_once=25)
+    for name in ("main", "variants", "larger")
+} | {
+    "curves": Experiment(run_curve, Cell, short, runs_at_once=25),
+    "grids": Experiment(run_grid, Grid, lambda grid: grid if grid.size == 5 else None, (0,)),
+}

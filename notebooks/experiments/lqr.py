@@ -9,6 +9,8 @@ import pandas as pd
 import torch
 from torch import Tensor
 
+from experiments.experiment import Experiment
+from experiments.rows import tidy
 from ipo.checks import check_count
 from ipo.game import nash_gap
 from ipo.lqr import (
@@ -23,7 +25,6 @@ from ipo.lqr import (
 )
 from ipo.lqr_learners import Settings, train
 
-MODULES = ("lqr_experiments",)
 VALIDATION_INTERVAL = 20  # iterations between two looks at the held-out domain
 
 
@@ -67,8 +68,8 @@ def run_cell(cell: Cell, seeds: list[int]) -> pd.DataFrame:
     problem = _problem(cell, seeds)
     if cell.label == "oracle":
         _, cost = riccati_gain(problem)
-        return _rows(cell, seeds, {("test", "test_cost"): cost})
-    return _rows(cell, seeds, evaluate(final_gain(cell, problem, seeds), problem))
+        return tidy(cell, seeds, {("test", "test_cost"): cost})
+    return tidy(cell, seeds, evaluate(final_gain(cell, problem, seeds), problem))
 
 
 def run_curve(cell: Cell, seeds: list[int], num_points: int = 40) -> pd.DataFrame:
@@ -78,9 +79,7 @@ def run_curve(cell: Cell, seeds: list[int], num_points: int = 40) -> pd.DataFram
     checkpoints = {round(last ** (i / num_points)) for i in range(num_points + 1)} | {0}
     parts = []
     for iteration, gain in train(problem, cell.settings, seeds, checkpoints=sorted(checkpoints)):
-        rows = _rows(cell, seeds, evaluate(gain, problem))
-        rows.insert(len(cell.columns), "iteration", iteration)
-        parts.append(rows)
+        parts.append(tidy(cell, seeds, evaluate(gain, problem), iteration=iteration))
     return pd.concat(parts, ignore_index=True)
 
 
@@ -144,9 +143,15 @@ def _norm(gain: Tensor) -> Tensor:
     return torch.linalg.matrix_norm(gain)
 
 
-def _rows(cell: Cell, seeds: list[int], metrics: dict[tuple[str, str], Tensor]) -> pd.DataFrame:
-    return pd.DataFrame(
-        {**cell.columns, "run": seed, "domain": domain, "metric": metric, "value": float(value)}
-        for (domain, metric), values in metrics.items()
-        for seed, value in zip(seeds, values, strict=True)
-    )
+def short(cell: Cell) -> Cell:
+    """At full size, some dozens of iterations."""
+    if cell.settings is None:
+        return cell
+    few = 3 if cell.settings.optimizer == "lbfgs" else 30
+    return replace(cell, settings=replace(cell.settings, num_iterations=few))
+
+
+EXPERIMENTS = {
+    name: Experiment(run_cell, Cell, short)
+    for name in ("tables", "starts", "more_domains", "closed_form", "optimizers", "controls")
+} | {"curves": Experiment(run_curve, Cell, short)}

@@ -20,7 +20,7 @@ from gymnasium import Env
 from matplotlib.figure import Figure
 
 from ipo.checks import check_choice
-from ipo.door import DoorParams, build_door, shift_handle
+from ipo.worlds.door import DoorParams, build_door, shift_handle
 
 
 def record(
@@ -163,7 +163,7 @@ def _free(context: Any, opengl: mujoco.MjrContext) -> None:
 
 
 def door_scene(params: DoorParams, width: int = 640, height: int = 480) -> mujoco.MjSpec:
-    """:func:`ipo.door.build_door` with paint, light, frame, wall and floor, for pictures."""
+    """:func:`ipo.worlds.door.build_door` with paint, light, frame, wall and floor, for pictures."""
     spec = build_door(params)
     spec.visual.global_.offwidth, spec.visual.global_.offheight = width, height
     spec.visual.quality.shadowsize, spec.visual.quality.offsamples = 4096, 8

@@ -4,28 +4,44 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import torch
 from torch import Tensor
 
-from ipo.keys_experiments import Cell, Keys, encode
+from experiments import keys
+from experiments.experiment import Experiment
+from experiments.keys import Keys, encode
+from experiments.rows import tidy
 from ipo.networks import OnTable, Weights
 from ipo.ppo import Training
-from ipo.tabular import TabularDomains, expected_return, optimal_policy
-
-MODULES = ("player_experiments",)
+from ipo.worlds.tabular import TabularDomains, expected_return, optimal_policy
 
 
-def run_players(
-    cell: Cell,
-    seeds: list[int],
-    tables: str | Path,
-    checkpoints: Sequence[int] = (),
-    num_alone: int = 5,
-) -> pd.DataFrame:
+@dataclass(frozen=True)
+class Cell:
+    """Players that are looked at while they are trained on coloured keys.
+
+    Attributes:
+        trained: how.
+        checkpoints: updates after which every player goes on alone.
+        num_alone: for so many updates.
+    """
+
+    trained: keys.Cell
+    checkpoints: tuple[int, ...] = ()
+    num_alone: int = 5
+
+    @property
+    def columns(self) -> dict[str, Any]:
+        return self.trained.columns
+
+
+def run_players(cell: Cell, seeds: list[int], tables: str | Path) -> pd.DataFrame:
     """Train on coloured keys and look at the players: rows with a column ``update``.
 
     After every update: how far the first and the last player are apart in their weights, how far
@@ -33,48 +49,45 @@ def run_players(
     (the correlation of the changes of their scores since the start, over all observations and
     actions of the training domains).
 
-    At the checkpoints also what each player gains in its own domain when it goes on alone for
-    ``num_alone`` updates while the others stand still. The best of them is a lower bound on the
+    At the checkpoints also what each player gains in its own domain when it goes on alone while
+    the others stand still. The best of them is a lower bound on the
     Nash gap. An upper bound is what is missing to the optimal return in the worst domain.
     """
-    task = Keys(tables, cell.color_encoding, cell.size)
-    domains = TabularDomains([task.tasks[color] for color in cell.train_colors])
-    network = OnTable(task.network, encode(domains.images, cell.color_encoding))
-    training = Training(
-        network, task.network.start, domains, len(cell.train_colors), cell.settings, seeds
-    )
+    trained = cell.trained
+    colors = trained.train_colors
+    task = Keys(tables, trained.color_encoding, trained.size)
+    domains = TabularDomains([task.tasks[color] for color in colors])
+    network = OnTable(task.network, encode(domains.images, trained.color_encoding))
+    training = Training(network, task.network.start, domains, len(colors), trained.settings, seeds)
     start = copy.deepcopy(training.players)
-    scores_at_start = [_scores(task, player, cell.train_colors) for player in start]
-    best = [optimal_policy(task.tasks[color])[1] for color in cell.train_colors]
+    scores_at_start = [_scores(task, player, colors) for player in start]
+    best = [optimal_policy(task.tasks[color])[1] for color in colors]
     parts = []
-    for update in range(cell.settings.num_updates + 1):
+    for update in range(trained.settings.num_updates + 1):
         if update:
             training.update()
-        returns = _returns(task, training.players, cell.train_colors)
+        returns = _returns(task, training.players, colors)
         metrics = {
             ("all", "distance_players"): _distance(training.players[0], training.players[-1]),
             ("all", "distance_start"): _distance(training.players[0], start[0]),
             ("train", "gap_upper"): np.max([b - r for b, r in zip(best, returns, strict=True)], 0),
         }
         metrics |= {
-            (color, "return_exact"): own
-            for color, own in zip(cell.train_colors, returns, strict=True)
+            (color, "return_exact"): own for color, own in zip(colors, returns, strict=True)
         }
         if update:
             moves = [
-                _scores(task, player, cell.train_colors) - before
+                _scores(task, player, colors) - before
                 for player, before in zip(training.players, scores_at_start, strict=True)
             ]
             metrics["all", "move_correlation"] = _correlation(moves[0], moves[-1])
-        if update in checkpoints:
+        if update in cell.checkpoints:
             gains = [
-                _returns(task, _alone(training, d, num_alone), cell.train_colors)[d] - returns[d]
+                _returns(task, _alone(training, d, cell.num_alone), colors)[d] - returns[d]
                 for d in range(len(training.players))
             ]
             metrics["train", "gap_lower"] = np.maximum(np.max(gains, 0), 0)
-        rows = _rows(cell, seeds, metrics)
-        rows.insert(len(cell.columns), "update", update)
-        parts.append(rows)
+        parts.append(tidy(cell, seeds, metrics, update=update))
     return pd.concat(parts, ignore_index=True)
 
 
@@ -118,9 +131,9 @@ def _distance(one: Weights, other: Weights) -> Tensor:
     return torch.stack(squares).sum(0).sqrt()
 
 
-def _rows(cell: Cell, seeds: Sequence[int], metrics: dict[tuple[str, str], Tensor]) -> pd.DataFrame:
-    return pd.DataFrame(
-        {**cell.columns, "run": seed, "domain": domain, "metric": metric, "value": float(value)}
-        for (domain, metric), values in metrics.items()
-        for seed, value in zip(seeds, values, strict=True)
-    )
+def short(cell: Cell) -> Cell:
+    """Two updates, and one of every player alone at the beginning and the end."""
+    return replace(cell, trained=keys.short(cell.trained), checkpoints=(0, 2), num_alone=1)
+
+
+EXPERIMENT = Experiment(run_players, Cell, short)

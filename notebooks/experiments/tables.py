@@ -8,7 +8,7 @@ from pathlib import Path
 import pandas as pd
 from pandas.io.formats.style import Styler
 
-from ipo.results import provenance
+from experiments.store import Store
 
 
 def show(frame: pd.DataFrame, formats: dict[str, str] | str | None = None) -> Styler:
@@ -25,7 +25,7 @@ def costs(folder: str | Path, names: Sequence[str]) -> Styler:
     """What it took to compute experiments, from the record beside the rows of each."""
 
     def row(name: str) -> dict[str, object]:
-        batches = provenance(folder, name)
+        batches = Store(Path(folder), name).batches()
         return {
             "experiment": name,
             "batches": len(batches),
@@ -33,7 +33,7 @@ def costs(folder: str | Path, names: Sequence[str]) -> Styler:
             "CPU minutes": sum(batch["cpu_seconds"] for batch in batches) / 60,
             "machine": ", ".join(sorted({batch["machine"] for batch in batches})),
             "torch": ", ".join(sorted({batch["versions"]["torch"] for batch in batches})),
-            "source": ", ".join(sorted({batch["source_hash"] for batch in batches})),
+            "commit": ", ".join(sorted({batch["commit"] for batch in batches})),
         }
 
     return show(pd.DataFrame(map(row, names)), {"CPU minutes": "{:.1f}"})

@@ -1,6 +1,6 @@
 """Train policies for doors, each run where it was interrupted.
 
-    python -m ipo.train_door [--cells ppo ipo] [--seeds 0 1 2]
+    python -m experiments.train_door [--cells ppo ipo] [--seeds 0 1 2]
 
 Runs are trained one after the other, seed by seed; those that are finished are left alone. A run
 that ends adds its policies and its learning curve to ``data/``; one that is interrupted loses at
@@ -10,14 +10,14 @@ most one update.
 from __future__ import annotations
 
 import argparse
-import functools
 from pathlib import Path
 
 import torch
 from tqdm import tqdm
 
-from ipo.door_training import CELLS, MODULES, train_run
-from ipo.results import run_or_load
+from experiments.door_training import CELLS, EXPERIMENT
+from experiments.experiment import Places
+from experiments.store import Store
 
 
 def main() -> None:
@@ -28,15 +28,15 @@ def main() -> None:
     options = parser.parse_args()
 
     torch.set_num_threads(1)  # the matrices are small: start the command twice for two cores
-    train = functools.partial(
-        train_run,
-        checkpoints=options.data / "checkpoints" / "door",
+    places = Places(
+        tables=options.data / "tabulated",
         policies=options.data / "policies" / "door",
+        checkpoints=options.data / "checkpoints" / "door",
     )
+    store = Store(options.data / "results" / "door", "curves")
     for seed in options.seeds:
         for label in options.cells:
-            folder = options.data / "results" / "door"
-            run_or_load(folder, "curves", [CELLS[label]], [seed], train, MODULES, num_workers=1)
+            store.fill(EXPERIMENT.at(places), [CELLS[label]], [seed], num_workers=1)
             tqdm.write(f"{label} {seed} is finished")
 
 

@@ -22,11 +22,11 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from ipo.door import DoorEnv
-from ipo.door_training import NETWORK, TRAIN_FRICTIONS, make_doors, published
+from experiments.door_training import NETWORK, TRAIN_FRICTIONS, make_doors, published
 from ipo.ppo import Training, improve
 from ipo.rollouts import collect
-from ipo.vector_door import VectorDoor
+from ipo.worlds.door import DoorEnv
+from ipo.worlds.many_doors import VectorDoor
 
 FRICTIONS = [0.0] * 24 + [0.1] * 8
 UPDATES = 190  # of 131,072 steps each: 25 million

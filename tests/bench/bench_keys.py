@@ -26,10 +26,10 @@ import torch
 from minigrid.wrappers import ImgObsWrapper
 from tqdm import tqdm
 
-from ipo.colored_keys import ColoredKeysEnv
-from ipo.keys_experiments import Cell, Keys
+from experiments.keys import Cell, Keys
 from ipo.ppo import published
-from ipo.tabular import expected_return, tabulate
+from ipo.worlds.colored_keys import ColoredKeysEnv
+from ipo.worlds.tabular import expected_return, tabulate
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import plain_ppo

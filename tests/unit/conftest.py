@@ -6,8 +6,9 @@ import hypothesis
 import pytest
 import torch
 
-from ipo.colored_keys import COLORS, ColoredKeysEnv
-from ipo.tabular import TabularTask, load_or_tabulate
+from experiments.tabulated import load_or_tabulate
+from ipo.worlds.colored_keys import COLORS, ColoredKeysEnv
+from ipo.worlds.tabular import TabularTask
 
 # Derandomised: the suite decides the same way on every machine and on every day.
 hypothesis.settings.register_profile("unit", deadline=None, derandomize=True, max_examples=25)

@@ -11,12 +11,12 @@ import pytest
 import torch
 from small import paper_problem
 
+from experiments.lqr import Cell, run_cell
+from experiments.store import run_or_load
 from ipo.checks import check_notebook_parameters
 from ipo.lqr import sample_problem, simulate
-from ipo.lqr_experiments import Cell, run_cell
 from ipo.lqr_learners import Settings, published, trained_gain
 from ipo.optimizers import make_optimizer
-from ipo.results import run_or_load
 from ipo.stats import bootstrap_interval, paired_difference, probability_of_improvement
 
 NAN, INF = math.nan, math.inf

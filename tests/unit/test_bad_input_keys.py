@@ -17,12 +17,13 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from test_bad_input import INF, LEAST_1, NAN, WHOLE, named
 
 import ipo  # noqa: F401  (registers the environment)
-from ipo.colored_keys import ColoredKeysEnv
-from ipo.keys_experiments import Cell, encode, run_cell
+from experiments.keys import Cell, encode, run_cell
+from experiments.tabulated import load_or_tabulate
 from ipo.networks import GridNetwork, Weights, load_policy, save_policy
 from ipo.ppo import Settings, published, train
-from ipo.tabular import NotTabularError, load_or_tabulate
 from ipo.vector_environments import FromGymnasium
+from ipo.worlds.colored_keys import ColoredKeysEnv
+from ipo.worlds.tabular import NotTabularError
 
 ALL_COLORS = "must be one of red, green, blue, purple, yellow, grey"
 

@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 import torch
 
-from ipo import checkpoints, door_training
-from ipo.checkpoints import (
+from experiments import checkpoints, door_training
+from experiments.checkpoints import (
     CheckpointError,
     CheckpointWarning,
     load_checkpoint,
     previous,
     save_checkpoint,
 )
-from ipo.door_training import NETWORK, Cell, Run, published, train_run
+from experiments.door_training import NETWORK, Cell, Run, published, train_run
 from ipo.networks import load_policy
 
 TREE = {
@@ -169,7 +169,7 @@ def test_kill_loses_one_update_at_most(tmp_path):
     script = tmp_path / "train.py"
     script.write_text(
         "import torch\n"
-        "from ipo.door_training import Cell, published, train_run\n"
+        "from experiments.door_training import Cell, published, train_run\n"
         "torch.set_num_threads(1)\n"
         "settings = published('ppo', num_updates=50, num_envs=(1, 1), num_steps=512,\n"
         "                     num_minibatches=2, num_epochs=1)\n"

@@ -9,7 +9,7 @@ from minigrid.core.constants import COLOR_TO_IDX, OBJECT_TO_IDX
 from minigrid.envs.doorkey import DoorKeyEnv
 
 import ipo  # noqa: F401  (registers the environment)
-from ipo.colored_keys import COLORS, ColoredKeysEnv
+from ipo.worlds.colored_keys import COLORS, ColoredKeysEnv
 
 RIGHT, DOWN = 0, 1  # directions of MiniGrid
 KEY, DOOR, GOAL, WALL = (OBJECT_TO_IDX[name] for name in ("key", "door", "goal", "wall"))

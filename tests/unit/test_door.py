@@ -17,7 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import ipo  # noqa: F401  (registers the environments)
-from ipo.door import (
+from ipo.worlds.door import (
     ANCHOR,
     FINGERTIP,
     WRIST,
@@ -33,7 +33,7 @@ from ipo.door import (
     shift_handle,
     target_position,
 )
-from ipo.vector_door import VectorDoor, WorkerError
+from ipo.worlds.many_doors import VectorDoor, WorkerError
 
 NAN = math.nan
 
@@ -426,7 +426,7 @@ def test_workers_end_with_their_parent(tmp_path):
     script = tmp_path / "parent.py"
     script.write_text(
         "import time\n"
-        "from ipo.vector_door import VectorDoor\n"
+        "from ipo.worlds.many_doors import VectorDoor\n"
         "if __name__ == '__main__':\n"
         "    doors = VectorDoor([0.0], num_workers=1)\n"
         "    doors.reset(seed=0)\n"

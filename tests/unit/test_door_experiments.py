@@ -4,10 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from ipo import door_training
-from ipo.dense_network import DenseNetwork
-from ipo.door import DoorEnv
-from ipo.door_experiments import (
+from experiments import door_training
+from experiments.door import (
     EVALUATION_SEED,
     Cell,
     door_seeds,
@@ -15,9 +13,11 @@ from ipo.door_experiments import (
     evaluation_doors,
     load_players,
 )
-from ipo.door_training import CELLS, NETWORK, make_doors, opened, policy_path, published
+from experiments.door_training import CELLS, NETWORK, make_doors, opened, policy_path, published
+from ipo.dense_network import DenseNetwork
 from ipo.networks import save_policy
-from ipo.vector_door import VectorDoor
+from ipo.worlds.door import DoorEnv
+from ipo.worlds.many_doors import VectorDoor
 
 
 @pytest.fixture

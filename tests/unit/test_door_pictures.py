@@ -8,9 +8,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from ipo.door import DoorEnv, DoorParams, build_door
-from ipo.hooking import Hooking
-from ipo.render import DoorPicture, RenderError, door_scene
+from experiments.pictures import DoorPicture, RenderError, door_scene
+from ipo.worlds.door import DoorEnv, DoorParams, build_door
+from ipo.worlds.hooking import Hooking
 
 SHIFT = np.array([0.05, -0.05])
 
@@ -81,8 +81,8 @@ def test_without_egl_the_message_names_the_packages_and_doors_still_work():
     code = (
         "import os; os.environ['PYOPENGL_PLATFORM'] = 'none'\n"
         "import numpy as np\n"
-        "from ipo.door import DoorEnv\n"
-        "from ipo.render import RenderError\n"
+        "from ipo.worlds.door import DoorEnv\n"
+        "from experiments.pictures import RenderError\n"
         "env = DoorEnv(render_mode='rgb_array'); env.reset(seed=0); env.step(np.zeros(6))\n"
         "try: env.render()\n"
         "except RenderError as error: print(error)\n"

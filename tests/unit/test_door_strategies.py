@@ -5,10 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ipo import door_experiments
-from ipo.door import DoorEnv, DoorParams
-from ipo.door_experiments import Cell
-from ipo.door_strategies import (
+from experiments import door as door_experiments
+from experiments.door import Cell
+from experiments.door_training import CELLS, NETWORK, opened, policy_path
+from ipo.networks import save_policy
+from ipo.worlds.door import DoorEnv, DoorParams
+from ipo.worlds.hooking import Hooking
+from ipo.worlds.pulling import (
     ScriptedCell,
     is_inside,
     strategy,
@@ -16,9 +19,6 @@ from ipo.door_strategies import (
     strategy_of_policy,
     watch,
 )
-from ipo.door_training import CELLS, NETWORK, opened, policy_path
-from ipo.hooking import Hooking
-from ipo.networks import save_policy
 
 
 def scripted(side: str, seed: int) -> str:

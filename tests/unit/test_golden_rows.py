@@ -5,8 +5,8 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from ipo.lqr_experiments import MODULES
-from ipo.results import provenance, stale_batches
+from experiments.lqr import MODULES
+from experiments.store import provenance, stale_batches
 
 DATA = Path(__file__).resolve().parents[2] / "data"
 RESULTS = DATA / "results" / "lqr"

@@ -10,7 +10,19 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ipo.irm import (
+from experiments.causality import (
+    CAUSAL,
+    FEATURES,
+    VARIANTS,
+    Cell,
+    anticausal,
+    chain,
+    chain_run,
+    digits_run,
+    population,
+    run_cell,
+)
+from ipo.causality.predictors import (
     METHODS,
     Classification,
     Regression,
@@ -23,19 +35,7 @@ from ipo.irm import (
     irmv1,
     vrex,
 )
-from ipo.irm_experiments import (
-    CAUSAL,
-    FEATURES,
-    VARIANTS,
-    Cell,
-    anticausal,
-    chain,
-    chain_run,
-    digits_run,
-    population,
-    run_cell,
-)
-from ipo.scm import moments, population_regression
+from ipo.causality.scm import moments, population_regression
 
 FAST = Settings(learning_rate=0.05, num_iterations=500)
 

@@ -9,8 +9,7 @@ import pytest
 import torch
 from minigrid.core.constants import OBJECT_TO_IDX
 
-from ipo.colored_keys import COLORS
-from ipo.keys_experiments import (
+from experiments.keys import (
     MODULES,
     Cell,
     Keys,
@@ -22,10 +21,11 @@ from ipo.keys_experiments import (
     run_cell,
     run_curve,
 )
+from experiments.store import provenance, stale_batches
 from ipo.networks import GridNetwork, load_policy
 from ipo.ppo import published
-from ipo.results import provenance, stale_batches
-from ipo.tabular import TabularTask, expected_return
+from ipo.worlds.colored_keys import COLORS
+from ipo.worlds.tabular import TabularTask, expected_return
 
 DATA = Path(__file__).resolve().parents[2] / "data"
 RESULTS, POLICIES = DATA / "results" / "keys", DATA / "policies" / "keys"

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 import torch
 
+from experiments.figures import network_graph
 from ipo.dense_network import DenseNetwork
 from ipo.distributions import Categorical
 from ipo.networks import GridNetwork
-from ipo.plots import network_graph
 
 NETWORKS = {
     "grid": (GridNetwork(), (1, 2, 7, 7, 3)),

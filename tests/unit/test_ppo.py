@@ -19,7 +19,6 @@ from minigrid.wrappers import ImgObsWrapper
 from small import DoubleNetwork, assert_close, plain_network
 from torch import Tensor
 
-from ipo.colored_keys import ColoredKeysEnv
 from ipo.distributions import Categorical
 from ipo.networks import GridNetwork, OnTable, Weights
 from ipo.ppo import (
@@ -33,8 +32,9 @@ from ipo.ppo import (
     train,
 )
 from ipo.rollouts import Rollout, Step, advantages, collect
-from ipo.tabular import TabularDomains, expected_return, optimal_policy, tabulate
 from ipo.vector_environments import FromGymnasium
+from ipo.worlds.colored_keys import ColoredKeysEnv
+from ipo.worlds.tabular import TabularDomains, expected_return, optimal_policy, tabulate
 
 SMALL = {
     "num_updates": 3,

@@ -5,8 +5,8 @@ import pytest
 import torch
 from small import assert_close, assert_near
 
-from ipo.game import average
-from ipo.scalar_control import (
+from experiments.algorithm import START, Cell, gains_of, problems, run_cell, standard
+from ipo.causality.scalar_control import (
     EDGE,
     costs,
     invariant_gains,
@@ -14,8 +14,8 @@ from ipo.scalar_control import (
     training_cost,
     unseen_cost,
 )
-from ipo.scalar_experiments import START, Cell, gains_of, problems, run_cell, standard
-from ipo.vector_game import Settings, last, wishes
+from ipo.causality.vector_game import Settings, last, wishes
+from ipo.game import average
 
 
 def double(values) -> torch.Tensor:

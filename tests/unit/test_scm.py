@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ipo import plots
-from ipo.scm import (
+from experiments import figures as plots
+from ipo.causality.scm import (
     SCM,
     Linear,
     Mechanism,

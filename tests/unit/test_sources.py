@@ -2,8 +2,8 @@
 
 import pytest
 
-from ipo import provenance
-from ipo.provenance import imported_modules, source_hash
+import sources
+from sources import imported_modules, source_hash
 
 SOURCES = {
     "costs": '''"""Costs."""
@@ -33,17 +33,20 @@ def package(tmp_path, monkeypatch):
     """A toy package in the place of ``ipo``."""
     for name, source in SOURCES.items():
         (tmp_path / f"{name}.py").write_text(source)
-    monkeypatch.setattr(provenance, "PACKAGE", tmp_path)
+    (tmp_path / "worlds").mkdir()
+    (tmp_path / "worlds" / "__init__.py").write_text("")
+    (tmp_path / "worlds" / "door.py").write_text("from ipo import limits\n")
+    monkeypatch.setattr(sources, "PACKAGES", {"ipo": tmp_path})
     return tmp_path
 
 
 def hash_after(package, name: str, old: str, new: str) -> tuple[str, str]:
     """The hash of ``costs`` before and after an edit of a module."""
-    before = source_hash(["costs"])
+    before = source_hash(["ipo.costs"])
     path = package / f"{name}.py"
     assert old in path.read_text()
     path.write_text(path.read_text().replace(old, new))
-    return before, source_hash(["costs"])
+    return before, source_hash(["ipo.costs"])
 
 
 @pytest.mark.parametrize(
@@ -99,19 +102,23 @@ def test_modules_that_import_each_other_can_be_hashed(package):
 
 
 def test_order_and_repetition_of_names_do_not_count():
-    assert source_hash(["limits", "unrelated"]) == source_hash(["unrelated", "limits", "costs"])
+    assert source_hash(["ipo.limits", "ipo.unrelated"]) == source_hash(
+        ["ipo.unrelated", "ipo.limits", "ipo.costs"]
+    )
 
 
 @pytest.mark.parametrize(
     ("code", "expected"),
     [
-        ("from ipo import costs, limits", {"costs", "limits"}),
-        ("from ipo import costs as c", {"costs"}),
-        ("from ipo.costs import cost", {"costs"}),
-        ("import ipo.costs", {"costs"}),
-        ("import ipo.costs as c, os.path", {"costs"}),
-        ("def late():\n    from ipo.costs import cost", {"costs"}),
+        ("from ipo import costs, limits", {"ipo.costs", "ipo.limits"}),
+        ("from ipo import costs as c", {"ipo.costs"}),
+        ("from ipo.costs import cost", {"ipo.costs"}),
+        ("import ipo.costs", {"ipo.costs"}),
+        ("import ipo.costs as c, os.path", {"ipo.costs"}),
+        ("def late():\n    from ipo.costs import cost", {"ipo.costs"}),
         ("from ipo import __version__", set()),
+        ("from ipo.worlds import door", {"ipo.worlds", "ipo.worlds.door"}),
+        ("from ipo.worlds.door import Door", {"ipo.worlds.door"}),
         ("import numpy\nfrom scipy import limits\nimport ipolite.costs", set()),
         ("text = 'from ipo import costs'", set()),
     ],

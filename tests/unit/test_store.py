@@ -1,5 +1,6 @@
 """Results with provenance: loaded, computed where missing, never lost, never wrong unnoticed."""
 
+import functools
 import json
 import os
 import re
@@ -14,10 +15,7 @@ import pytest
 import toy_experiment
 from toy_experiment import CELLS, SEEDS, Cell, fill
 
-from ipo import results
-from ipo.results import ResultsError, StaleResultsError, StaleResultsWarning
-
-ROOT = Path(__file__).resolve().parents[2]
+from experiments.store import OriginError, ResultsError, Store
 
 
 @pytest.fixture(scope="module")
@@ -37,9 +35,10 @@ def folder(complete, tmp_path) -> Path:
 
 
 class Calls:
-    """A ``run`` that remembers what it was asked to compute."""
+    """A ``run`` that remembers what it was asked to compute, under the toy's name."""
 
     def __init__(self) -> None:
+        functools.update_wrapper(self, toy_experiment.run)
         self.asked: list[tuple[Cell, list[int]]] = []
 
     def __call__(self, cell: Cell, seeds: list[int]) -> pd.DataFrame:
@@ -53,8 +52,9 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 def start_program(folder: Path, *death: str) -> subprocess.Popen:
-    command = [sys.executable, toy_experiment.__file__, str(folder), *death]
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    call = "import sys, toy_experiment; toy_experiment.main(*sys.argv[1:])"
+    command = [sys.executable, "-c", call, str(folder), *death]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
     return subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL)
 
 
@@ -122,6 +122,7 @@ def test_processes_compute_what_one_computes(tmp_path, complete):
 
 @pytest.mark.parametrize("value", [float("inf"), 1e-300, 0.1 + 0.2])
 def test_values_survive_the_file(tmp_path, value):
+    @functools.wraps(toy_experiment.run)
     def run(cell, seeds):
         return toy_experiment.run(cell, seeds).assign(value=value)
 
@@ -130,15 +131,16 @@ def test_values_survive_the_file(tmp_path, value):
     assert first["value"][0] == pytest.approx(value, rel=1e-8)
 
 
-def test_provenance_says_where_each_batch_comes_from(folder):
-    batches = results.provenance(folder, "toy")
+def test_origin_says_where_each_batch_comes_from(folder):
+    batches = Store(folder, "toy").batches()
     assert [batch["cell"]["size"] for batch in batches] == [10, 2, 2]
     for batch in batches:
         assert batch["seeds"] == [0, 1, 2]
         assert batch["num_rows"] == 6
-        assert batch["source_hash"] == results.source_hash(["stats"])
+        assert batch["run"].endswith("toy_experiment.run") and batch["options"] == {}
         assert batch["versions"]["pandas"] == pd.__version__
-        assert {"cpu_seconds", "wall_seconds", "machine", "finished"} <= batch.keys()
+        assert {"numpy", "torch", "mujoco", "minigrid", "gymnasium"} <= batch["versions"].keys()
+        assert {"cpu_seconds", "wall_seconds", "machine", "commit", "finished"} <= batch.keys()
 
 
 # ------------------------------------------------------------------------ interruption
@@ -173,6 +175,7 @@ def test_two_programs_can_fill_the_same_results(tmp_path, complete):
 
 
 def test_finished_batches_survive_a_failing_one(tmp_path):
+    @functools.wraps(toy_experiment.run)
     def run(cell, seeds):
         return toy_experiment.run(cell, seeds) if cell == CELLS[0] else 1 / 0
 
@@ -212,9 +215,9 @@ def without(name: str) -> Callable[[Path], None]:
 
 DAMAGE = {
     "truncated row": (edit("toy.csv", r"\d\n$", ""), r"toy\.csv.*cut short or changed"),
-    "truncated number": (edit("toy.csv", r",[^,]*\n$", ",\n"), r"toy\.csv.*cut short or changed"),
+    "truncated number": (edit("toy.csv", r",[^,]*\n$", ",\n"), r"toy: cannot be read"),
     "missing row": (edit("toy.csv", r".*\n$", ""), r"toy\.csv.*5 rows, 6 were written; restore"),
-    "half a file": (edit("toy.csv", r"(?s)fast,10,2.*", "fast,10,2,te"), r"toy\.csv.*cut short"),
+    "half a file": (edit("toy.csv", r"(?s)fast,10,2.*", "fast,10,2,te"), r"toy: cannot be read"),
     "double row": (edit("toy.csv", r"(.*\n)$", r"\1\1"), r"toy\.csv.*7 rows, 6 were written"),
     "changed value": (edit("toy.csv", r"1\.41", "1.42"), r"toy\.csv.*cut short or changed"),
     "changed domain": (edit("toy.csv", "test", "train"), r"toy\.csv.*cut short or changed"),
@@ -257,103 +260,94 @@ def test_missing_folder_is_made(tmp_path):
     assert contents(tmp_path / "new" / "folder").keys() == {"toy.csv", "toy.json"}
 
 
-# ---------------------------------------------------------------------------- staleness
-
-
-@pytest.fixture
-def new_code(monkeypatch) -> None:
-    monkeypatch.setattr(results, "source_hash", lambda modules: "today")
+# ------------------------------------------------------------------------------ origin
 
 
 NEW_POWER = (Cell("slow", 2, power=0.25), *CELLS[1:])
 
 
-def test_rows_of_other_code_are_refused(folder, new_code):
-    before, calls = contents(folder), Calls()
-    message = r"toy\.csv: 3 stale batches.*source \w{16}, today's is today.*move toy\.csv and"
-    with pytest.raises(StaleResultsError, match=message):
-        fill(folder, [*CELLS, Cell("new", 1)], run=calls)
-    assert calls.asked == []
+def with_option(cell, seeds, power=2):
+    return toy_experiment.run(cell, seeds)
+
+
+def another_run(cell, seeds):
+    return toy_experiment.run(cell, seeds)
+
+
+def input_of(path: Path):
+    return lambda cell, seed: [path]
+
+
+def refused(folder: Path, message: str, **asked) -> None:
+    """What is asked for is not what is there: an error before any work, and nothing changes."""
+    before = contents(folder)
+    with pytest.raises(OriginError, match=message):
+        fill(folder, **asked)
     assert contents(folder) == before
 
 
 def test_rows_of_other_parameters_are_refused(folder):
-    before = contents(folder)
-    message = r"toy\.csv: 1 stale batches\. .*'size': 2}: power = 0\.5, asked for 0\.25"
-    with pytest.raises(StaleResultsError, match=message):
-        fill(folder, NEW_POWER)
-    assert contents(folder) == before
+    message = r"toy\.csv: the rows of .*'size': 2}.*cell\.power = 0\.5, asked for 0\.25.*move toy"
+    refused(folder, message, cells=[*NEW_POWER, Cell("new", 1)])
 
 
-def test_stale_rows_are_shown_on_request_with_a_warning(folder, new_code):
-    before, calls = contents(folder), Calls()
-    with pytest.warns(StaleResultsWarning, match=r"3 stale batches") as warnings:
-        rows = fill(folder, run=calls, allow_stale=True)
-    assert len(rows) == 18 and calls.asked == []
-    assert contents(folder) == before
-    assert len(warnings) == 1
+def test_rows_of_another_run_function_are_refused(folder):
+    refused(folder, r"run = '.*toy_experiment\.run', asked for '.*another_run'", run=another_run)
 
 
-def test_stale_rows_are_proved_by_computing_a_batch_of_each_cell(tmp_path, monkeypatch):
-    fill(tmp_path, runs_at_once=2)
-    rows, old = contents(tmp_path)["toy.csv"], results.source_hash(["stats"])
-    monkeypatch.setattr(results, "source_hash", lambda modules: "today")
-    calls = Calls()
-    fill(tmp_path, run=calls, confirm=True)
-    assert calls.asked == [(cell, [0, 1]) for cell in CELLS]
-    assert contents(tmp_path)["toy.csv"] == rows
-    batches = results.provenance(tmp_path, "toy")
-    assert {batch["source_hash"] for batch in batches} == {"today"}
-    for batch in batches:
-        assert batch["earlier"] == [
-            {"cell": batch["cell"], "source_hash": old, "proved_by_seeds": [0, 1]}
-        ]
-    fill(tmp_path, run=calls, confirm=True)
-    assert len(calls.asked) == len(CELLS)  # nothing is left to prove
+def test_rows_of_another_option_are_refused(tmp_path):
+    fill(tmp_path, run=with_option)
+    fill(tmp_path, run=functools.partial(with_option, power=2))  # the default, said aloud
+    changed = functools.partial(with_option, power=3)
+    refused(tmp_path, r"options\.power = 2, asked for 3", run=changed)
 
 
-def test_other_parameters_with_the_same_rows_are_proved_too(tmp_path):
-    def run(cell, seeds):  # does not look at the power
-        return toy_experiment.run(Cell(cell.method, cell.size), seeds)
+def test_rows_of_another_input_are_refused(tmp_path):
+    path = tmp_path / "inputs" / "policy"
+    path.parent.mkdir()
+    path.write_bytes(b"weights")
+    folder = tmp_path / "rows"
+    fill(folder, reads=input_of(path))
+    fill(folder, reads=input_of(path))
+    path.write_bytes(b"other weights")
+    refused(folder, r"reads\.policy = '\w{16}', asked for '\w{16}'", reads=input_of(path))
+    path.unlink()
+    refused(folder, r"reads\.policy = '\w{16}', asked for 'no such file'", reads=input_of(path))
 
+
+def test_runs_that_nobody_asks_for_need_no_inputs(tmp_path):
+    path = tmp_path / "policy"
+    path.write_bytes(b"weights")
+    by_seed = tmp_path / "other"
+    by_seed.write_bytes(b"weights")
+    fill(tmp_path / "rows", reads=lambda cell, seed: [path if seed else by_seed])
+    by_seed.unlink()
+    again = fill(tmp_path / "rows", seeds=[1, 2], reads=lambda cell, seed: [path])
+    assert sorted(again["run"].unique()) == [1, 2]
+
+
+def test_places_are_no_options(tmp_path):
+    def run(cell, seeds, tables):
+        return toy_experiment.run(cell, seeds)
+
+    fill(tmp_path / "rows", run=functools.partial(run, tables=tmp_path / "here"))
+    fill(tmp_path / "rows", run=functools.partial(run, tables=tmp_path / "there"))
+
+
+def test_other_cells_of_a_file_do_not_matter(tmp_path):
     fill(tmp_path, CELLS[:1])
-    other = Cell(CELLS[0].method, CELLS[0].size, power=0.25)
-    fill(tmp_path, [other], run=run, confirm=True)
-    (batch,) = results.provenance(tmp_path, "toy")
-    assert (batch["cell"]["power"], batch["earlier"][0]["cell"]["power"]) == (0.25, 0.5)
-    with pytest.raises(StaleResultsError, match=r"power = 0\.25, asked for 0\.5"):
-        fill(tmp_path, CELLS[:1])
+    assert len(fill(tmp_path, [CELLS[1], CELLS[2]])) == 12
 
 
-def test_other_rows_are_no_proof(folder, new_code):
-    def run(cell, seeds):
-        rows = toy_experiment.run(cell, seeds)
-        return rows.assign(value=rows["value"] * (1 + 1e-6 * (cell.size == 2)))
-
-    before = contents(folder)["toy.csv"]
-    with pytest.raises(
-        StaleResultsError, match=r"'fast', 'size': 2}, runs \[0, 1, 2\].*other rows"
-    ):
-        fill(folder, [CELLS[1], CELLS[2]], run=run, confirm=True)
-    assert contents(folder)["toy.csv"] == before
-    with pytest.raises(StaleResultsError, match="1 stale batches"):
-        fill(folder, [CELLS[1], CELLS[2]])
-
-
-def test_stale_rows_of_other_cells_do_not_matter(tmp_path, monkeypatch):
-    fill(tmp_path, CELLS[:1])
-    monkeypatch.setattr(results, "source_hash", lambda modules: "today")
-    assert len(fill(tmp_path, CELLS[1:])) == 12
-
-
-def test_stale_batches_are_those_of_other_code(tmp_path, monkeypatch):
-    fill(tmp_path, CELLS[:1])
-    assert results.stale_batches(tmp_path, "toy", ["stats"]) == []
-    monkeypatch.setattr(results, "source_hash", lambda modules: "today")
-    fill(tmp_path, CELLS[1:])
-    (batch,) = results.stale_batches(tmp_path, "toy", ["stats"])
-    assert batch["columns"] == CELLS[0].columns
+@pytest.mark.parametrize("label", ["NA", "None", "1", "nan", "a,b", ""])
+def test_labels_come_back_as_they_were(tmp_path, label):
+    cells = [Cell(label, 2)]
+    first = fill(tmp_path, cells)
+    pd.testing.assert_frame_equal(fill(tmp_path, cells), first)
+    assert set(first["method"]) == {label}
 
 
 def test_record_is_json_that_others_can_read(folder):
-    assert json.loads((folder / "toy.json").read_text())["batches"][0]["cell"]["power"] == 0.5
+    record = json.loads((folder / "toy.json").read_text())
+    assert record["batches"][0]["cell"]["power"] == 0.5
+    assert record["types"]["domain"] == "str"

@@ -2,7 +2,7 @@
 
 import copy
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import gymnasium
 import numpy as np
@@ -15,14 +15,14 @@ from hypothesis import strategies as st
 from minigrid.core.constants import COLOR_TO_IDX, OBJECT_TO_IDX
 from minigrid.envs import DynamicObstaclesEnv
 
-from ipo import tabular
-from ipo.colored_keys import COLORS, ColoredKeysEnv
-from ipo.tabular import (
+from experiments import tabulated
+from experiments.tabulated import load_or_tabulate
+from ipo.worlds.colored_keys import COLORS, ColoredKeysEnv
+from ipo.worlds.tabular import (
     NotTabularError,
     TabularDomains,
     TabularTask,
     expected_return,
-    load_or_tabulate,
     occupancy,
     optimal_policy,
     reach,
@@ -404,7 +404,7 @@ def calls(monkeypatch, keys) -> list:
         asked.append((env.width, env.color))
         return keys[env.color]
 
-    monkeypatch.setattr(tabular, "tabulate", remember)
+    monkeypatch.setattr(tabulated, "tabulate", remember)
     return asked
 
 
@@ -416,15 +416,24 @@ def test_table_is_made_once_and_loaded_afterwards(tmp_path, calls, keys):
     assert_same(again, keys["red"])
 
 
-def test_other_options_code_or_minigrid_give_another_table(tmp_path, calls, monkeypatch):
+def test_other_options_or_minigrid_give_another_table(tmp_path, calls, monkeypatch):
     load_or_tabulate(ColoredKeysEnv, tmp_path, color="red")
     load_or_tabulate(ColoredKeysEnv, tmp_path, color="blue")
     load_or_tabulate(ColoredKeysEnv, tmp_path, color="blue", size=5)
-    monkeypatch.setattr(tabular, "version", lambda package: "3.2.99")
+    monkeypatch.setattr(tabulated, "version", lambda package: "3.2.99")
     load_or_tabulate(ColoredKeysEnv, tmp_path, color="red")
-    monkeypatch.setattr(tabular, "source_hash", lambda modules: "other code")
+    assert len(calls) == 4 and len(list(tmp_path.glob("*.npz"))) == 4
+
+
+def test_table_that_the_environment_contradicts_is_made_again(tmp_path, calls, keys):
     load_or_tabulate(ColoredKeysEnv, tmp_path, color="red")
-    assert len(calls) == 5 and len(list(tmp_path.glob("*.npz"))) == 5
+    (path,) = tmp_path.glob("*.npz")
+    wrong = replace(keys["red"], goal_reward=keys["red"].goal_reward - 0.1)
+    for other in (wrong, keys["blue"]):
+        assert not tabulated.agrees(other, ColoredKeysEnv(color="red"))
+        np.savez_compressed(path, **vars(other))
+        assert_same(load_or_tabulate(ColoredKeysEnv, tmp_path, color="red"), keys["red"])
+    assert len(calls) == 3
 
 
 def test_table_of_a_killed_program_is_made_again(tmp_path, calls):

@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from small import assert_close, assert_near
 
+from ipo.causality.linear_game import Regression, correlated_noise, effect_of_target, irm_v1
+from ipo.causality.vector_game import Settings, gap, last, play, residual, vote, wishes
 from ipo.game import average
-from ipo.linear_game import Regression, correlated_noise, effect_of_target, irm_v1
-from ipo.vector_game import Settings, gap, last, play, residual, vote, wishes
 
 coefficients = st.lists(st.integers(-10, 10), min_size=2, max_size=5).map(
     lambda values: [value / 10 for value in values]

@@ -1,12 +1,12 @@
 """A tiny experiment with results on disk, and a program that runs it and may be killed by itself.
 
-python toy_experiment.py FOLDER [computing | renaming NUMBER]
+``main(FOLDER, "computing" or "renaming", NUMBER)`` ends with the process at that moment.
 """
 
+import functools
 import itertools
 import os
 import signal
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +14,9 @@ from typing import Any
 
 import pandas as pd
 
-from ipo import results
+from experiments import files
+from experiments.experiment import Experiment
+from experiments.store import Store
 
 
 @dataclass(frozen=True)
@@ -51,14 +53,17 @@ def fill(
     num_workers: int = 1,
     **options,
 ) -> pd.DataFrame:
-    """Run or load ``folder/toy.csv``; the source of ``ipo.stats`` stands for the toy's own."""
-    return results.run_or_load(folder, "toy", cells, seeds, run, ["stats"], num_workers, **options)
+    """Run or load ``folder/toy.csv``; options are those of an ``Experiment``."""
+    return Store(Path(folder), "toy").fill(
+        Experiment(run, Cell, **options), cells, seeds, num_workers
+    )
 
 
 def die_at(number: int, function: Callable) -> Callable:
     """The function, but instead of its ``number``-th call the process is killed."""
     calls = itertools.count(1)
 
+    @functools.wraps(function)
     def mortal(*args):
         if next(calls) == number:
             os.kill(os.getpid(), signal.SIGKILL)
@@ -67,11 +72,11 @@ def die_at(number: int, function: Callable) -> Callable:
     return mortal
 
 
-if __name__ == "__main__":
-    folder, *death = sys.argv[1:]
+def main(folder: str, *death: str) -> None:
+    chosen = run
     match death:
         case ["computing", number]:
-            run = die_at(int(number), run)
+            chosen = die_at(int(number), run)
         case ["renaming", number]:
-            results.os.replace = die_at(int(number), os.replace)
-    fill(folder, run=run)
+            files.os.replace = die_at(int(number), os.replace)
+    fill(folder, run=chosen)

@@ -1,0 +1,1 @@
+"""The worlds that policies act in: coloured keys (MiniGrid) and doors (MuJoCo)."""

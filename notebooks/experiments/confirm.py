@@ -1,0 +1,139 @@
+"""One full batch of every cell again: before a release, or after a change on purpose.
+
+    python -m experiments.confirm [--since COMMIT] [chapter ...]
+
+For each cell the first recorded batch is computed again and held beside the shipped rows:
+
+- ``exact``: equal in all nine digits, as on the same kind of machine;
+- ``close``: every value within the chapter's tolerance;
+- ``alike``: for networks, whose training is chaotic, the same distribution over runs: no p-value
+  of a Kolmogorov-Smirnov test, in each metric and domain, is below 0.001 over their number;
+- ``differs`` otherwise, and the command fails in the end.
+
+The outcome stands in ``data/witness/confirmed.json`` with the commit of the code. What has been
+confirmed at the present commit of the code, or since COMMIT, is not computed again, so that an
+interrupted run goes on.
+"""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import json
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import joblib
+import pandas as pd
+import scipy.stats
+from filelock import FileLock
+from tqdm import tqdm
+
+from experiments import origin
+from experiments.files import replace_text
+from experiments.registry import CHAPTERS, DATA
+from experiments.store import Store, digest
+from experiments.witness import WITNESS, Slice, side_by_side, within
+
+CONFIRMED = WITNESS / "confirmed.json"
+CHAOTIC = ("keys/main", "keys/variants", "keys/larger", "keys/curves", "algorithm/players")
+LEVEL = 0.001
+
+
+def full_batches(chapters: Sequence[str]) -> Iterator[Slice]:
+    """The first batch of every cell."""
+    for chapter in chapters:
+        for name in CHAPTERS[chapter]:
+            seen = set()
+            for batch in Store(DATA / "results" / chapter, name).batches():
+                columns = json.dumps(batch["columns"])
+                if columns not in seen:
+                    seen.add(columns)
+                    yield Slice(chapter, name, batch)
+
+
+def title(part: Slice) -> str:
+    """What a cell is called in the record."""
+    return " ".join([f"{part.chapter}/{part.name}", *map(str, part.batch["columns"].values())])
+
+
+def confirm(chapters: Sequence[str], since: str | None = None, num_workers: int = -1) -> list[str]:
+    """Confirm what is not; returns the titles of the cells that differ."""
+    done = confirmed()
+    waiting = [part for part in full_batches(chapters) if not _is_done(done, title(part), since)]
+    waiting.sort(key=lambda part: -part.batch["cpu_seconds"])  # long ones first: no idle core
+    total = sum(part.batch["cpu_seconds"] for part in waiting) / 60
+    print(f"{len(waiting)} cells, {total:.0f} CPU-minutes by their records", flush=True)
+    with TemporaryDirectory() as scratch:
+        jobs = (joblib.delayed(_outcome)(part, Path(scratch)) for part in waiting)
+        work = joblib.Parallel(n_jobs=num_workers, return_as="generator_unordered")(jobs)
+        for name, outcome in tqdm(work, total=len(waiting), unit="cell"):
+            _save(name, outcome)
+    names = {title(part) for part in full_batches(chapters)}
+    return sorted(n for n, was in confirmed().items() if n in names and was["how"] == "differs")
+
+
+def confirmed() -> dict[str, dict[str, Any]]:
+    """The record: by cell how it was confirmed, when, and at which commit of the code."""
+    return json.loads(CONFIRMED.read_text(encoding="utf-8")) if CONFIRMED.exists() else {}
+
+
+def compared(part: Slice, rows: pd.DataFrame) -> str:
+    """How rows that were computed again compare with the shipped ones."""
+    if digest(rows) == part.batch["sha256"]:
+        return "exact"
+    shipped = Store(DATA / "results" / part.chapter, part.name).rows_of(part.batch)
+    both = side_by_side(shipped, rows)
+    if both is None:
+        return "differs"
+    if within(both, part.chapter).all():
+        return "close"
+    if f"{part.chapter}/{part.name}" not in CHAOTIC:
+        return "differs"
+    keys = [column for column in ("frames", "update", "domain", "metric") if column in both]
+    p = [
+        scipy.stats.ks_2samp(group["value"], group["value_now"]).pvalue
+        for _, group in both.groupby(keys)
+    ]
+    return "alike" if min(p) > LEVEL / len(p) else "differs"
+
+
+def _outcome(part: Slice, scratch: Path) -> tuple[str, dict[str, Any]]:
+    rows = part.run(scratch)
+    return title(part), {
+        "how": compared(part, rows),
+        "runs": len(part.batch["seeds"]),
+        "commit": origin.commit(),
+        "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
+        "machine": origin.machine(),
+    }
+
+
+def _is_done(done: dict[str, dict[str, Any]], name: str, since: str | None) -> bool:
+    if name not in done or done[name]["how"] == "differs":
+        return False
+    return origin.is_since(since or origin.commit(), done[name]["commit"])
+
+
+def _save(name: str, outcome: dict[str, Any]) -> None:
+    with FileLock(CONFIRMED.with_suffix(".lock")):
+        record = dict(sorted((confirmed() | {name: outcome}).items()))
+        replace_text(CONFIRMED, json.dumps(record, indent=1) + "\n")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("chapters", nargs="*", default=list(CHAPTERS))
+    parser.add_argument("--since", help="what was confirmed at this commit, or later, counts")
+    options = parser.parse_args()
+    if unknown := set(options.chapters) - CHAPTERS.keys():
+        parser.error(f"there is no chapter {min(unknown)!r}; the chapters are {list(CHAPTERS)}")
+    if different := confirm(options.chapters, options.since):
+        sys.exit("These cells differ from the shipped rows:\n" + "\n".join(different))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,83 @@
+"""What an experiment is: how rows are made of a cell, and which slice of a cell is its witness."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import inspect
+import types
+import typing
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import pandas as pd
+
+
+class Cell(Protocol):
+    """What identifies a batch of runs: a frozen dataclass whose ``columns`` name its rows."""
+
+    @property
+    def columns(self) -> dict[str, Any]: ...
+
+
+@dataclass(frozen=True)
+class Places:
+    """Folders that run functions are given by name, where they have a parameter of that name.
+
+    Attributes:
+        tables: of tabulated tasks.
+        policies: of saved policies, which are written or read.
+        checkpoints: of trainings that are not finished.
+    """
+
+    tables: Path
+    policies: Path
+    checkpoints: Path
+
+    def bind(self, function: Callable) -> Callable:
+        """The function with its folders."""
+        known = inspect.signature(function).parameters
+        folders = {name: path for name, path in vars(self).items() if name in known}
+        return functools.partial(function, **folders) if folders else function
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """How rows are made of cells.
+
+    Attributes:
+        run: ``run(cell, seeds)`` returns the rows, with the cell's columns and ``run``. It may be
+            a ``functools.partial``, whose options become part of the rows' origin.
+        cell: the class of the cells.
+        short: the slice of a cell that ``make verify`` computes again: the same cell with few
+            iterations, updates or doors. ``None`` for a cell of which another one has the slice.
+        seeds: of the slice.
+        reads: ``reads(cell, seed)`` are the files that a run reads; ``None``: it reads none.
+        runs_at_once: runs of a cell that are computed, and saved, together; ``None``: all.
+    """
+
+    run: Callable[..., pd.DataFrame]
+    cell: type | None = None
+    short: Callable[[Any], Any | None] = lambda cell: cell
+    seeds: tuple[int, ...] = (0, 1)
+    reads: Callable[..., list[Path]] | None = None
+    runs_at_once: int | None = None
+
+    def at(self, places: Places) -> Experiment:
+        """The same, where the run function knows its folders."""
+        reads = places.bind(self.reads) if self.reads else None
+        return dataclasses.replace(self, run=places.bind(self.run), reads=reads)
+
+
+def rebuilt(kind: Any, value: Any) -> Any:
+    """A dataclass, and what it is made of, from the plain values of its record."""
+    if isinstance(kind, types.UnionType):
+        if value is None:
+            return None
+        kind = next(k for k in typing.get_args(kind) if k is not type(None))
+    if dataclasses.is_dataclass(kind):
+        hints = typing.get_type_hints(kind)
+        return kind(**{name: rebuilt(hints[name], part) for name, part in value.items()})
+    return tuple(value) if isinstance(value, list) else value

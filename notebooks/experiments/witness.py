@@ -1,0 +1,178 @@
+"""Currency is a test: cheap slices of every kind of cell, recorded once and computed again.
+
+    python -m experiments.witness verify [chapter ...]
+    python -m experiments.witness record [chapter ...]
+
+The slices are rows like the results, in ``data/witness/``, of the same cells with few iterations,
+updates or doors. Code, or a package, that still gives them is taken to give the shipped results;
+where a value differs by more than its tolerance, ``verify`` names cell, metric, old and new value.
+Whoever changes results on purpose records the slices again, and says so in the changelog.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import joblib
+import pandas as pd
+from tqdm import tqdm
+
+from experiments import own_domains
+from experiments.experiment import Cell, rebuilt
+from experiments.registry import CHAPTERS, DATA, again
+from experiments.store import Batch, Store, timed
+
+WITNESS = DATA / "witness"
+
+# By how much values may differ between machines: relative, absolute. In double precision little
+# more than rounding; networks are in single precision, and their rounding grows with each step.
+TOLERANCE = {
+    "lqr": (1e-4, 1e-5),
+    "causality": (1e-4, 1e-6),
+    "algorithm": (1e-6, 1e-9),
+    "keys": (1e-3, 1e-5),
+    "door": (1e-3, 1e-5),
+    "your_own_domains": (1e-3, 1e-3),
+}
+# One draw, one label or one door can flip where two numbers are nearly the same.
+FLIPS = {
+    "return_published_protocol": 0.02,
+    "train_error": 0.005,
+    "validation_error": 0.005,
+    "test_error": 0.005,
+}
+SHOWN = ("iteration", "frames", "update", "run", "domain", "door", "metric")
+
+
+@dataclass(frozen=True)
+class Slice:
+    """One recorded batch, to be computed again."""
+
+    chapter: str
+    name: str
+    batch: Batch
+
+    def run(self, scratch: Path) -> pd.DataFrame:
+        experiment = again(self.chapter, self.name, scratch)
+        cell = rebuilt(experiment.cell, self.batch["cell"])
+        return timed(experiment.run, cell, self.batch["seeds"])[1]
+
+
+def slices(chapters: Sequence[str]) -> Iterator[Slice]:
+    """All recorded slices of some chapters."""
+    for chapter in chapters:
+        for name in CHAPTERS[chapter]:
+            for batch in Store(WITNESS / chapter, name).batches():
+                yield Slice(chapter, name, batch)
+
+
+def verify(chapters: Sequence[str] = tuple(CHAPTERS), num_workers: int = -1) -> list[str]:
+    """What differs between the recorded slices and those of today's code, in words."""
+    chosen = list(slices(chapters))
+    problems = [
+        f"{chapter}/{name}: no slice is recorded"
+        for chapter in chapters
+        for name, experiment in CHAPTERS[chapter].items()
+        if not any((s.chapter, s.name) == (chapter, name) for s in chosen)
+    ]
+    with TemporaryDirectory() as scratch:
+        jobs = (joblib.delayed(_attempt)(part, Path(scratch)) for part in chosen)
+        work = joblib.Parallel(n_jobs=num_workers, return_as="generator")(jobs)
+        for part, rows in tqdm(zip(chosen, work, strict=True), total=len(chosen), unit="slice"):
+            problems += differences(part, rows)
+    return problems
+
+
+def _attempt(part: Slice, scratch: Path) -> pd.DataFrame | str:
+    try:
+        return part.run(scratch)
+    except Exception as error:  # whatever it is, it is a difference, and the others go on
+        return f"{type(error).__name__}: {error}"
+
+
+def differences(part: Slice, rows: pd.DataFrame | str) -> list[str]:
+    """Values of a slice that are not what was recorded."""
+    title = f"{part.chapter}/{part.name}, {part.batch['columns']}"
+    if isinstance(rows, str):
+        return [f"{title}: {rows}"]
+    recorded = Store(WITNESS / part.chapter, part.name).rows_of(part.batch)
+    both = side_by_side(recorded, rows)
+    if both is None:
+        return [f"{title}: has other rows than the {len(recorded)} that were recorded"]
+    return [
+        f"{title}: {describe(row)}: {row['value']:.9g} recorded, {row['value_now']:.9g} now"
+        for row in both[~within(both, part.chapter)].to_dict("records")
+    ]
+
+
+def side_by_side(recorded: pd.DataFrame, rows: pd.DataFrame) -> pd.DataFrame | None:
+    """Recorded rows with what is computed now as ``value_now``; None if it is of other rows."""
+    keys = [column for column in recorded.columns if column != "value"]
+    if set(rows.columns) != set(recorded.columns):
+        return None
+    now = rows.astype(recorded.dtypes.to_dict()).rename(columns={"value": "value_now"})
+    both = recorded.merge(now, on=keys, how="outer", indicator=True)
+    if len(both) != len(recorded) or (both["_merge"] != "both").any():
+        return None
+    return both
+
+
+def within(both: pd.DataFrame, chapter: str) -> pd.Series:
+    """Which values are the same within the chapter's tolerance."""
+    relative, absolute = TOLERANCE[chapter]
+    old, new = both["value"], both["value_now"]
+    allowed = relative * old.abs() + absolute + both["metric"].map(FLIPS).fillna(0.0)
+    return (new == old) | ((new - old).abs() <= allowed)
+
+
+def describe(row: dict[str, object]) -> str:
+    """Which row it is, beside the columns of its cell."""
+    return ", ".join(f"{key} {row[key]}" for key in SHOWN if key in row)
+
+
+def record(chapters: Sequence[str], num_workers: int = -1) -> None:
+    """Compute and save the slices that are not recorded yet, of all cells that results have."""
+    for chapter in chapters:
+        for name, experiment in CHAPTERS[chapter].items():
+            with TemporaryDirectory() as scratch:
+                cells, seeds = list(short_cells(chapter, name)), list(experiment.seeds)
+                at = again(chapter, name, Path(scratch))
+                Store(WITNESS / chapter, name).fill(at, cells, seeds, num_workers)
+
+
+def short_cells(chapter: str, name: str) -> Iterator[Cell]:
+    """The slices of the cells of an experiment, each once."""
+    experiment = CHAPTERS[chapter][name]
+    recorded = Store(DATA / "results" / chapter, name).batches()
+    cells = [rebuilt(experiment.cell, batch["cell"]) for batch in recorded]
+    if chapter == "your_own_domains":  # a page without shipped results
+        cells = own_domains.CELLS
+    short = [experiment.short(cell) for cell in cells]
+    yield from dict.fromkeys(cell for cell in short if cell is not None)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("action", choices=("verify", "record"))
+    parser.add_argument("chapters", nargs="*", default=list(CHAPTERS))
+    options = parser.parse_args()
+    if unknown := set(options.chapters) - CHAPTERS.keys():
+        parser.error(f"there is no chapter {min(unknown)!r}; the chapters are {list(CHAPTERS)}")
+    if options.action == "record":
+        record(options.chapters)
+        return
+    problems = verify(options.chapters)
+    for problem in problems:
+        print(problem)
+    if problems:
+        sys.exit(f"{len(problems)} values differ from what was recorded")
+    print(f"{len(list(slices(options.chapters)))} slices give what was recorded")
+
+
+if __name__ == "__main__":
+    main()
