@@ -15,6 +15,48 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
+from ipo.checks import check_choice, check_count
+
+METHODS = ("pooled", "ipo", "ensemble")  # who owns which domains
+
+
+def domains_of_players(method: str, num_domains: int) -> list[list[int]]:
+    """The domains that each player owns.
+
+    ``pooled`` is one player that owns all; in ``ipo`` each domain has a player of its own; an
+    ``ensemble`` has as many players as ``ipo``, and each owns all domains.
+    """
+    check_choice("method", method, METHODS)
+    check_count("num_domains", num_domains)
+    everything = list(range(num_domains))
+    return {
+        "pooled": [everything],
+        "ipo": [[d] for d in everything],
+        "ensemble": [everything] * num_domains,
+    }[method]
+
+
+def play_round(
+    num_players: int,
+    respond: Callable[[int], None],
+    num_inner_rounds: int = 1,
+    move_phi: Callable[[], None] | None = None,
+) -> None:
+    """One iteration of Algorithm 1, whatever the players are made of.
+
+    Args:
+        num_players: E.
+        respond: ``respond(d)`` makes player d's move while the others stand still.
+        num_inner_rounds: K; it is 1 in all runs of the paper.
+        move_phi: lets the part that all players share make its move on the cost of all domains;
+            ``None``: Phi is fixed.
+    """
+    if move_phi is not None:  # lines 2 to 6
+        move_phi()
+    for _ in range(num_inner_rounds):  # line 7
+        for d in range(num_players):  # line 8
+            respond(d)  # lines 9 and 10: what the next player sees is the new average
+
 
 def new_players(num_runs: int, num_players: int, shape: Sequence[int], **options) -> Tensor:
     """Weights of all players, zero: ``[runs, players, *shape]``.
