@@ -89,9 +89,11 @@ class Regression:
         """The risk ``[R]`` of every domain as a function of its own."""
 
         def cost_in(gram: Tensor, moment: Tensor, power: Tensor) -> Cost:
-            return lambda v: (
-                power - 2 * (v * moment).sum(-1) + torch.einsum("rp,rpq,rq->r", v, gram, v)
-            )
+            def cost(v: Tensor) -> Tensor:
+                quadratic = torch.einsum("rp,rpq,rq->r", v, gram, v)
+                return power - 2 * (v * moment).sum(-1) + quadratic
+
+            return cost
 
         domains = zip(self.gram.unbind(1), self.moment.unbind(1), self.power.unbind(1), strict=True)
         return [cost_in(*domain) for domain in domains]
