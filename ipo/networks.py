@@ -21,13 +21,14 @@ import torch
 from torch import Tensor
 
 from ipo.checks import check_count
-from ipo.distributions import Categorical, Distribution, Gaussian
+from ipo.distributions import Categorical, Distribution, Gaussian, Generators
 from ipo.game import average
 
 PIECE = 256  # rows of a table that are evaluated together
 
 Weights = dict[str, Tensor]
 Outputs = tuple[Tensor, Tensor]
+Acting = Callable[[Tensor], Outputs]  # what is done where observations are seen
 
 
 class Network(ABC):
@@ -47,7 +48,7 @@ class Network(ABC):
         shapes = {f"{layer}.weight": shape for layer, shape in self.shapes.items()}
         return shapes | {f"{layer}.bias": shape[1:] for layer, shape in self.shapes.items()}
 
-    def start(self, generators: Sequence[np.random.Generator]) -> Weights:
+    def start(self, generators: Generators) -> Weights:
         """Random weights, one run for each generator."""
         runs = [self._draw(generator) for generator in generators]
         return {
@@ -63,7 +64,7 @@ class Network(ABC):
     def __call__(self, weights: Weights, observations: Tensor) -> Outputs:
         """``observations [R, B, ...]`` -> parameters ``[R, B, P]``, values ``[R, B]``."""
 
-    def frozen(self, players: Sequence[Weights]) -> Callable[[Tensor], Outputs]:
+    def frozen(self, players: Sequence[Weights]) -> Acting:
         """The average that acts, without gradients, as a function of observations."""
 
         @torch.no_grad()
@@ -138,7 +139,7 @@ class DenseNetwork(Network):
             parameters = torch.cat([parameters, deviation.expand_as(parameters)], -1)
         return parameters, values
 
-    def frozen(self, players: Sequence[Weights]) -> Callable[[Tensor], Outputs]:
+    def frozen(self, players: Sequence[Weights]) -> Acting:
         """The average that acts, as a function of ``observations [R, B, O]``.
 
         In NumPy: for the few rows of a step, torch would take five times as long.
@@ -249,7 +250,7 @@ class OnTable:
         logits, values = zip(*pieces, strict=True)
         return torch.cat(logits, 1), torch.cat(values, 1)
 
-    def frozen(self, players: Sequence[Weights]) -> Callable[[Tensor], Outputs]:
+    def frozen(self, players: Sequence[Weights]) -> Acting:
         """The average of ``players`` as they are now, as a function of ``indices [R, B]``."""
         logits, values = self.average(players)
         return lambda indices: (_take(logits, indices), values.gather(1, indices))

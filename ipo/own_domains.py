@@ -26,12 +26,13 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from ipo.checks import check_count, check_counts
-from ipo.distributions import Categorical, Gaussian
+from ipo.distributions import Categorical, Gaussian, Generators
 from ipo.networks import DenseNetwork, Network, Weights, copied
 from ipo.ppo import PPOSettings, Training
 from ipo.rollouts import FromGymnasium
 
-Domains = Mapping[str, Callable[[], gymnasium.Env]]
+Make = Callable[[], gymnasium.Env]
+Domains = Mapping[str, Make]
 
 PPO_RATE, IPO_RATE = 1e-3, 5e-4  # of the paper
 
@@ -111,7 +112,7 @@ def train_policy(
     makers = list(domains.values())
 
     def environments(
-        chosen: list[int], num_copies: list[int], generators: Sequence[np.random.Generator]
+        chosen: list[int], num_copies: list[int], generators: Generators
     ) -> FromGymnasium:
         return _environments([makers[d] for d in np.repeat(chosen, num_copies)], generators)
 
@@ -220,12 +221,10 @@ def check_domains(name: str, domains: Domains, minimum: int = 1) -> tuple[Space,
     return observations, actions
 
 
-def _environments(
-    makers: Sequence[Callable[[], gymnasium.Env]], generators: Sequence[np.random.Generator]
-) -> FromGymnasium:
+def _environments(makers: Sequence[Make], generators: Generators) -> FromGymnasium:
     """One copy of each maker for every run, with resets from the run's generator."""
 
-    def wrapped(make: Callable[[], gymnasium.Env]) -> gymnasium.Env:
+    def wrapped(make: Make) -> gymnasium.Env:
         env = make()
         return ClipAction(env) if isinstance(env.action_space, Box) else env
 
@@ -237,12 +236,7 @@ def _environments(
     return environments
 
 
-def _returns(
-    policy: Policy,
-    make: Callable[[], gymnasium.Env],
-    num_episodes: int,
-    generators: Sequence[np.random.Generator],
-) -> Tensor:
+def _returns(policy: Policy, make: Make, num_episodes: int, generators: Generators) -> Tensor:
     """Return of the first episode of every copy, ``[R, N]``."""
     environments = _environments([make] * num_episodes, generators)
     acting = policy.network.frozen(policy.players)

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from ipo.checks import check_choice, check_count, check_counts, check_number
-from ipo.distributions import Distribution
+from ipo.distributions import Distribution, Generators
 from ipo.game import domains_of_players, play_round
 from ipo.networks import Network, OnTable, Weights
 from ipo.rollouts import TIME_OUTS, Collector, Environments, Rollout
@@ -28,7 +28,7 @@ METHODS = ("ppo", "ipo", "ensemble")
 NORMALIZATIONS = ("none", "minibatch", "rollout")
 
 # (domains, how many copies of each, a generator for each run) -> environments
-MakeEnvironments = Callable[[list[int], list[int], Sequence[np.random.Generator]], Environments]
+MakeEnvironments = Callable[[list[int], list[int], Generators], Environments]
 
 
 @dataclass(frozen=True)
@@ -296,10 +296,7 @@ class Training:
 
 
 def minibatches(
-    frames: Rollout,
-    settings: PPOSettings,
-    generators: Sequence[np.random.Generator],
-    skip_last_frames: bool,
+    frames: Rollout, settings: PPOSettings, generators: Generators, skip_last_frames: bool
 ) -> Iterator[Tensor]:
     """Indices ``[R, B]`` of frames in an order of each run's own."""
     numbers = np.arange(frames.actions.shape[1])

@@ -5,7 +5,6 @@ Axes: R runs, N copies of the environments, T steps.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
@@ -14,8 +13,8 @@ import torch
 from gymnasium.vector import AutoresetMode, VectorEnv
 from torch import Tensor
 
-from ipo.distributions import Distribution
-from ipo.networks import Outputs
+from ipo.distributions import Distribution, Generators
+from ipo.networks import Acting
 
 TIME_OUTS = ("bootstrap", "terminal", "no_advantage")
 
@@ -171,10 +170,7 @@ class Collector:
             )
 
     def collect(
-        self,
-        policy: Callable[[Tensor], Outputs],
-        distribution: type[Distribution],
-        generators: Sequence[np.random.Generator],
+        self, policy: Acting, distribution: type[Distribution], generators: Generators
     ) -> Rollout:
         """T steps of a policy in all copies; each run draws its actions from its generator."""
         steps = [self._act(policy, distribution, generators) for _ in range(self.num_steps)]
@@ -193,10 +189,7 @@ class Collector:
         return Rollout(observations, actions, log_probabilities, values, gains, values + gains)
 
     def _act(
-        self,
-        policy: Callable[[Tensor], Outputs],
-        distribution: type[Distribution],
-        generators: Sequence[np.random.Generator],
+        self, policy: Acting, distribution: type[Distribution], generators: Generators
     ) -> tuple[Tensor, ...]:
         observation = self.observation
         parameters, values = policy(observation)
