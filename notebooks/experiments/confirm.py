@@ -1,6 +1,6 @@
 """One full batch of every cell again: before a release, or after a change on purpose.
 
-    python -m experiments.confirm [--since COMMIT] [chapter ...]
+    python -m experiments.confirm [--since COMMIT] [lqr keys/main ...]
 
 For each cell the first recorded batch is computed again and held beside the shipped rows:
 
@@ -33,7 +33,7 @@ from tqdm import tqdm
 
 from experiments import origin
 from experiments.files import replace_text
-from experiments.registry import CHAPTERS, DATA
+from experiments.registry import DATA, chosen
 from experiments.store import Store, select
 from experiments.witness import WITNESS, Slice, side_by_side, within
 
@@ -47,16 +47,15 @@ LONGER = 10.0  # times the tolerance of a slice: rounding grows over thousands o
 NOT_PLACES = ("run", "value", "value_now", "_merge")
 
 
-def full_batches(chapters: Sequence[str]) -> Iterator[Slice]:
+def full_batches(names: Sequence[str]) -> Iterator[Slice]:
     """The first batch of every cell."""
-    for chapter in chapters:
-        for name in CHAPTERS[chapter]:
-            seen = set()
-            for batch in Store(DATA / "results" / chapter, name).batches():
-                columns = json.dumps(batch["columns"])
-                if columns not in seen:
-                    seen.add(columns)
-                    yield Slice(chapter, name, batch)
+    for chapter, name in chosen(names):
+        seen = set()
+        for batch in Store(DATA / "results" / chapter, name).batches():
+            columns = json.dumps(batch["columns"])
+            if columns not in seen:
+                seen.add(columns)
+                yield Slice(chapter, name, batch)
 
 
 def title(part: Slice) -> str:
@@ -64,20 +63,20 @@ def title(part: Slice) -> str:
     return " ".join([f"{part.chapter}/{part.name}", *map(str, part.batch["columns"].values())])
 
 
-def confirm(chapters: Sequence[str], since: str | None = None, num_workers: int = -1) -> list[str]:
-    """Confirm what is not; returns the titles of the cells that differ."""
+def confirm(names: Sequence[str] = (), since: str | None = None) -> list[str]:
+    """Confirm what is not, on all cores; returns the titles of the cells that differ."""
     done = confirmed()
-    waiting = [part for part in full_batches(chapters) if not _is_done(done, title(part), since)]
+    waiting = [part for part in full_batches(names) if not _is_done(done, title(part), since)]
     waiting.sort(key=lambda part: -part.batch["cpu_seconds"])  # long ones first: no idle core
     total = sum(part.batch["cpu_seconds"] for part in waiting) / 60
     print(f"{len(waiting)} cells, {total:.0f} CPU-minutes by their records", flush=True)
     with TemporaryDirectory() as scratch:
         jobs = (joblib.delayed(_outcome)(part, Path(scratch)) for part in waiting)
-        work = joblib.Parallel(n_jobs=num_workers, return_as="generator_unordered")(jobs)
-        for name, outcome in tqdm(work, total=len(waiting), unit="cell"):
-            _save(name, outcome)
-    names = {title(part) for part in full_batches(chapters)}
-    return sorted(n for n, was in confirmed().items() if n in names and was["how"] == "differs")
+        work = joblib.Parallel(n_jobs=-1, return_as="generator_unordered")(jobs)
+        for cell, outcome in tqdm(work, total=len(waiting), unit="cell"):
+            _save(cell, outcome)
+    record = confirmed()
+    return [cell for cell in map(title, full_batches(names)) if record[cell]["how"] == "differs"]
 
 
 def confirmed() -> dict[str, dict[str, Any]]:
@@ -145,12 +144,10 @@ def _save(name: str, outcome: dict[str, Any]) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("chapters", nargs="*", default=list(CHAPTERS))
+    parser.add_argument("names", nargs="*", help="chapters, or experiments such as lqr/tables")
     parser.add_argument("--since", help="what was confirmed at this commit, or later, counts")
     options = parser.parse_args()
-    if unknown := set(options.chapters) - CHAPTERS.keys():
-        parser.error(f"there is no chapter {min(unknown)!r}; the chapters are {list(CHAPTERS)}")
-    if different := confirm(options.chapters, options.since):
+    if different := confirm(options.names, options.since):
         sys.exit("These cells differ from the shipped rows:\n" + "\n".join(different))
 
 
