@@ -19,6 +19,7 @@ from experiments.door_training import (
     policy_path,
 )
 from experiments.experiment import Experiment
+from experiments.rows import tidy
 from ipo.checks import check_count
 from ipo.networks import Weights
 
@@ -52,28 +53,19 @@ class Cell:
 def gains_alone(cell: Cell, seeds: Sequence[int], policies: str | Path) -> pd.DataFrame:
     """Rows with the mean return in every player's domain, ``before`` and ``after`` it went on.
 
-    The largest gain of a player is a lower bound on the Nash gap of the run.
+    Actions are the most likely ones, at the doors of the evaluation. The largest gain of a player
+    is a lower bound on the Nash gap of the run.
     """
-    rows = []
+    parts = []
     for seed in seeds:
         players = load_players(policies, cell.trained.label, seed, cell.updates, "last")
+        metrics = {}
         for d, friction in enumerate(TRAIN_FRICTIONS):
-            better = gone_on(cell, seed, players, d)
-            found = {
-                "before": mean_return(players, friction, cell.num_doors),
-                "after": mean_return(better, friction, cell.num_doors),
-            }
-            rows += [
-                {
-                    **cell.columns,
-                    "run": seed,
-                    "domain": str(friction),
-                    "metric": metric,
-                    "value": value,
-                }
-                for metric, value in found.items()
-            ]
-    return pd.DataFrame(rows)
+            for name, own in (("before", players), ("after", gone_on(cell, seed, players, d))):
+                found = last_info(own, friction, cell.num_doors, EVALUATION_SEED)
+                metrics[str(friction), name] = [found["episode_return"].mean()]
+        parts.append(tidy(cell, [seed], metrics))
+    return pd.concat(parts, ignore_index=True)
 
 
 def gone_on(cell: Cell, seed: int, players: Sequence[Weights], d: int) -> list[Weights]:
@@ -83,12 +75,6 @@ def gone_on(cell: Cell, seed: int, players: Sequence[Weights], d: int) -> list[W
     for _ in tqdm(range(cell.num_alone), desc=f"player {d}", unit="update", leave=False):
         training.update(only=d)
     return training.players
-
-
-def mean_return(players: Sequence[Weights], friction: float, num_doors: int) -> float:
-    """Of the most likely actions of the players' average, over the doors of the evaluation."""
-    found = last_info(players, friction, num_doors, EVALUATION_SEED)
-    return float(found["episode_return"].mean())
 
 
 def short(cell: Cell) -> Cell:
