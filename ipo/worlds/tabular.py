@@ -75,12 +75,6 @@ def tabulate(env: Env, max_states: int = 100_000) -> TabularTask:
     for probability, image in _all_starts(env):
         state = visited.visit(image)
         start[state] = start.get(state, 0.0) + probability
-
-    goal_reward = np.empty(env.max_steps)
-    for step in range(env.max_steps):
-        env.step_count = step + 1
-        goal_reward[step] = env._reward()
-
     assert isinstance(env.action_space, Discrete)
     actions = range(env.action_space.n)
     rows: list[list[tuple[int, bool, bool]]] = []
@@ -93,7 +87,7 @@ def tabulate(env: Env, max_states: int = 100_000) -> TabularTask:
         next_state=table[..., 0].astype(np.int32),
         goal=table[..., 1].astype(bool),
         done=table[..., 2].astype(bool),
-        goal_reward=goal_reward,
+        goal_reward=goal_reward(env),
         start=np.array([start.get(state, 0.0) for state in range(len(rows))]),
         observation=np.array(visited.observation, dtype=np.int32),
         images=np.stack(visited.images),
@@ -101,6 +95,16 @@ def tabulate(env: Env, max_states: int = 100_000) -> TabularTask:
         position=np.array(visited.position),
         signature=np.array([_signature(key) for key in visited.index], dtype=np.uint64),
     )
+
+
+def goal_reward(env: Env) -> np.ndarray:
+    """What MiniGrid gives for reaching the goal in step 1, 2, ... T; ``reset`` must follow."""
+    env = _minigrid(env)
+    rewards = np.empty(env.max_steps)
+    for step in range(env.max_steps):
+        env.step_count = step + 1
+        rewards[step] = env._reward()
+    return rewards
 
 
 def state_of(task: TabularTask, env: Env) -> int:
