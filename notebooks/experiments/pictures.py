@@ -133,7 +133,7 @@ class DoorPicture:
         ]
         self.follows = camera == "handle"
 
-    def frame(self, qpos: np.ndarray, handle_shift: np.ndarray = (0.0, 0.0)) -> np.ndarray:
+    def frame(self, qpos: np.ndarray, handle_shift: np.ndarray) -> np.ndarray:
         """A picture ``[height, width, 3]`` of the joints ``[7]``."""
         shift_handle(self.model, self.params, handle_shift)
         self.data.qpos[:] = qpos

@@ -1,10 +1,9 @@
-"""Speed of the doors: simulation, one update of PPO and of IPO, memory, two processes.
+"""Speed of the doors: simulation, one update of PPO and of IPO, memory.
 
     python tests/bench/bench_door.py [--blocks 6] [--steps 60] [--json PATH]
 
 CPU time is compared in short blocks that take turns, so that a busy machine slows all alike. What
-training needs is the published settings' rollout and updates, measured once and multiplied; the
-wall time of one and two workers is only worth something on a machine that is otherwise idle.
+training needs is the published settings' rollout and updates, measured once and multiplied.
 """
 
 from __future__ import annotations
@@ -107,20 +106,6 @@ def update_costs(method: str) -> dict[str, float]:
     return costs
 
 
-def wall_speed(num_workers: int, num_steps: int) -> float:
-    """Steps of 256 doors per second of the clock."""
-    doors = VectorDoor([0.0] * 256, num_workers=num_workers)
-    doors.reset(seed=0)
-    actions = np.random.default_rng(0).normal(size=(num_steps, 256, 6))
-    doors.step(actions[0])
-    before = time.perf_counter()
-    for action in actions:
-        doors.step(action)
-    speed = num_steps * 256 / (time.perf_counter() - before)
-    doors.close()
-    return speed
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--blocks", type=int, default=6)
@@ -146,13 +131,10 @@ def main() -> None:
         print(f"  {method:32}{sum(minutes.values()):12.1f}   ({text})")
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     print(f"Memory at its peak: {memory:.2f} GiB")
-    workers = {number: wall_speed(number, options.steps) for number in (1, 2)}
-    print(f"Steps per second of the clock, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}")
-    for number, value in workers.items():
-        print(f"  {number} workers {value:33,.1f}")
     if options.json:
         numbers = {"speeds": speeds, "update_cpu_seconds": costs, "memory_gib": memory}
-        replace_text(options.json, json.dumps(numbers | {"workers": workers}, indent=1) + "\n")
+        replace_text(options.json, json.dumps(numbers, indent=1) + "
+")
 
 
 if __name__ == "__main__":

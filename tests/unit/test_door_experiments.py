@@ -64,7 +64,7 @@ def test_the_same_doors_at_every_friction(monkeypatch):
 
     class Spy(VectorDoor):
         def close(self, **options):
-            seen.append(self.parts[0].doors.params)
+            seen.append(self.params)
             super().close(**options)
 
     monkeypatch.setattr(door_training, "VectorDoor", Spy)
@@ -96,7 +96,7 @@ def test_runs_of_the_same_seed_have_the_same_doors_without_friction():
     def first_doors(domains, copies):
         doors = make_doors(domains, copies, [np.random.default_rng(3)])
         doors.reset()
-        return doors.envs.parts[0].doors.params[:4]
+        return doors.envs.params[:4]
 
     assert first_doors([0, 1], [4, 2]) == first_doors([0], [4])
 

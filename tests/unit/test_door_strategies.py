@@ -6,18 +6,16 @@ import numpy as np
 import pytest
 
 from experiments import door as door_experiments
-from experiments.door import Cell
+from experiments.door import Cell, ScriptedCell, watch
 from experiments.door_training import CELLS, NETWORK, opened, policy_path
 from ipo.networks import save_policy
 from ipo.worlds.door import DoorEnv, DoorParams
 from ipo.worlds.hooking import Hooking
 from ipo.worlds.pulling import (
-    ScriptedCell,
     is_inside,
     strategy,
     strategy_of_part,
     strategy_of_policy,
-    watch,
 )
 
 
