@@ -6,46 +6,27 @@ over runs; with few runs they are a little too narrow.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import scipy.stats
 
-from ipo.checks import check_number
-
 NUM_RESAMPLES = 10_000
 
 
-def iqm(values: Sequence[float], axis: int = -1) -> np.ndarray:
-    """Interquartile mean: the mean of the middle half of the runs."""
-    return scipy.stats.trim_mean(values, 0.25, axis=axis)
-
-
-def bootstrap_interval(
-    values: Sequence[float],
-    rng: np.random.Generator,
-    statistic: Callable = np.mean,
-    level: float = 0.95,
-) -> tuple[float, float]:
-    """Percentile bootstrap interval of a statistic of runs ``[num_runs]``.
-
-    Args:
-        statistic: takes an array and ``axis``, such as ``np.mean`` or :func:`iqm`.
-        level: nominal coverage, between 0 and 1.
+def bootstrap_interval(values: Sequence[float], rng: np.random.Generator) -> tuple[float, float]:
+    """95 % percentile bootstrap interval of the mean of runs ``[num_runs]``.
 
     Raises:
-        ValueError: fewer than two runs, values that are not finite, a level outside (0, 1).
+        ValueError: fewer than two runs, values that are not finite.
     """
     values = _checked("values", values)
-    check_number("level", level, above=0)
-    if level >= 1:
-        raise ValueError(f"level = {level}: must be below 1")
     if np.ptp(values) == 0:  # every resample is the same; scipy would warn and return NaN
         return float(values[0]), float(values[0])
     interval = scipy.stats.bootstrap(
         (values,),
-        statistic,
-        confidence_level=level,
+        np.mean,
+        confidence_level=0.95,
         n_resamples=NUM_RESAMPLES,
         axis=-1,
         method="percentile",

@@ -130,11 +130,11 @@ class SCM:
     def descendants(self, name: str) -> set[str]:
         """All variables that an intervention on ``name`` can change, itself aside."""
         check_choice("variable", name, self.assignments)
-        found = {name}
+        affected = {name}
         for other in self.order:
-            if found & set(self.parents(other)):
-                found.add(other)
-        return found - {name}
+            if affected & set(self.parents(other)):
+                affected.add(other)
+        return affected - {name}
 
     def sample(self, num_samples: int, rng: np.random.Generator) -> pd.DataFrame:
         """Independent samples, a column for each variable.

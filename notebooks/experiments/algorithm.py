@@ -15,7 +15,7 @@ from experiments import players
 from experiments.experiment import Experiment
 from experiments.rows import tidy
 from ipo.causality.scalar_control import costs
-from ipo.causality.vector_game import Settings, last, residual
+from ipo.causality.small_games import GameSettings, last, residual
 from ipo.checks import check_choice
 from ipo.game import average
 
@@ -39,7 +39,7 @@ class Cell:
     """
 
     label: str
-    settings: Settings
+    settings: GameSettings
     betas: tuple[float | None, ...]
     family: str = "given"
     start: tuple[float, float] = START
@@ -54,7 +54,7 @@ class Cell:
         return {"method": self.label, "family": self.family, "betas": betas, "start": start}
 
 
-def standard(num_domains: int) -> dict[str, Settings]:
+def standard(num_domains: int) -> dict[str, GameSettings]:
     """The ways of training that the chapter compares, by their label in the rows.
 
     With plain steps, IPO's average moves by learning_rate / E times the mean gradient in a
@@ -64,23 +64,23 @@ def standard(num_domains: int) -> dict[str, Settings]:
     plain = {"learning_rate": 0.2 * num_domains, "num_rounds": 2000, "max_gradient_norm": 1.0}
     adam = {"optimizer": "adam", "learning_rate": 2e-3, "num_rounds": 4000}
     bounded = {
-        f"ipo_bound{bound:g}": Settings("ipo", bound=bound, **plain) for bound in (0.5, 1, 2, 5)
+        f"ipo_bound{bound:g}": GameSettings("ipo", bound=bound, **plain) for bound in (0.5, 1, 2, 5)
     }
     return bounded | {
-        "pooled": Settings("pooled", **(plain | {"learning_rate": 0.05})),
-        "pooled_adam": Settings("pooled", **adam),
-        "ipo_plain": Settings(
+        "pooled": GameSettings("pooled", **(plain | {"learning_rate": 0.05})),
+        "pooled_adam": GameSettings("pooled", **adam),
+        "ipo_plain": GameSettings(
             "ipo", **(plain | {"learning_rate": 0.002 * num_domains, "num_rounds": 10_000})
         ),
-        "ipo_plain_large": Settings("ipo", **(plain | {"learning_rate": 0.05 * num_domains})),
-        "ipo_plain_together": Settings(
+        "ipo_plain_large": GameSettings("ipo", **(plain | {"learning_rate": 0.05 * num_domains})),
+        "ipo_plain_together": GameSettings(
             "ipo", order="together", **(plain | {"learning_rate": 0.05 * num_domains})
         ),
-        "ipo_adam": Settings("ipo", **adam),
-        "ipo_adam_together": Settings("ipo", order="together", **adam),
-        "ipo_adam_large": Settings("ipo", **(adam | {"learning_rate": 2e-2})),
-        "ensemble_adam": Settings("ensemble", **adam),
-        "separate_adam": Settings("separate", **adam),
+        "ipo_adam": GameSettings("ipo", **adam),
+        "ipo_adam_together": GameSettings("ipo", order="together", **adam),
+        "ipo_adam_large": GameSettings("ipo", **(adam | {"learning_rate": 2e-2})),
+        "ensemble_adam": GameSettings("ensemble", **adam),
+        "separate_adam": GameSettings("separate", **adam),
     }
 
 

@@ -23,7 +23,7 @@ from ipo.lqr import (
     sample_problem,
     training_costs,
 )
-from ipo.lqr_learners import Settings, train
+from ipo.lqr_learners import LQRSettings, train
 
 VALIDATION_INTERVAL = 20  # iterations between two looks at the held-out domain
 
@@ -46,7 +46,7 @@ class Cell:
     label: str
     num_domains: int
     dim_distractor: int
-    settings: Settings | None
+    settings: LQRSettings | None
     early_stopping: bool = False
     precision: str = "float32"
 
@@ -119,7 +119,7 @@ def evaluate(gain: Tensor, problem: LQR) -> dict[tuple[str, str], Tensor]:
     }
 
 
-def _early_stopped_gain(problem: LQR, settings: Settings, seeds: list[int]) -> Tensor:
+def _early_stopped_gain(problem: LQR, settings: LQRSettings, seeds: list[int]) -> Tensor:
     n_x = problem.A.shape[-1]
     check_count("num_domains", problem.num_domains, minimum=2)
     inner = replace(problem, seen=problem.seen[..., :-n_x])
