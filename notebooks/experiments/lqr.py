@@ -1,10 +1,12 @@
-"""From a configuration of the LQR experiment to tidy rows, one per run, domain and metric."""
+"""The chapter on LQR: its cells, from a cell to tidy rows, and its tables."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import torch
 from torch import Tensor
@@ -16,14 +18,16 @@ from ipo.game import nash_gap
 from ipo.lqr import (
     LQR,
     expected_cost,
+    invariant_gain,
     minimum_norm_gain,
     project,
     riccati_gain,
     row_space,
     sample_problem,
+    simulate,
     training_costs,
 )
-from ipo.lqr_learners import Settings, train
+from ipo.lqr_learners import METHODS, Settings, published, train
 
 VALIDATION_INTERVAL = 20  # iterations between two looks at the held-out domain
 
@@ -60,6 +64,121 @@ class Cell:
         }
 
 
+# ------------------------------------------------------------------- what is asked for
+
+
+def published_cell(
+    method: str, num_domains: int, dim_distractor: int, num_iterations: int = 5000
+) -> Cell:
+    """A method as published, except for the number of iterations."""
+    settings = replace(published(method), num_iterations=num_iterations)
+    return Cell(method, num_domains, dim_distractor, settings)
+
+
+def table_cells(sizes: Iterable[tuple[int, int]], num_iterations: int) -> list[Cell]:
+    """The four methods and the oracle, for pairs of n_d and n_y."""
+    return [
+        cell
+        for size in sizes
+        for cell in (
+            *(published_cell(method, *size, num_iterations) for method in METHODS),
+            Cell("oracle", *size, settings=None),
+        )
+    ]
+
+
+def start_cells(
+    num_domains: int, dim_distractor: int, few_distractors: int, num_iterations: int
+) -> list[Cell]:
+    """Readings of the random starts, which are not published: scales of Phi and of what follows."""
+
+    def started(method: str, phi_scale: float, gain_scale: float, n_y: int) -> Cell:
+        cell = published_cell(method, num_domains, n_y, num_iterations)
+        settings = replace(cell.settings, phi_scale=phi_scale, gain_scale=gain_scale)
+        name = f"{method}_phi{phi_scale:g}_gain{gain_scale:g}"
+        return replace(cell, label=name, settings=settings)
+
+    pairs = ((0.001, 0.001), (0.01, 0.01), (0.01, 0), (0.03, 0.001), (0.03, 0), (0.1, 0), (0.3, 0))
+    return [
+        *(
+            started("overparameterized", scale, scale, dim_distractor)
+            for scale in (0.0001, 0.001, 0.003, 0.01)
+        ),
+        *(started("ipo_variable_phi", *scales, dim_distractor) for scales in pairs),
+        *(
+            started("ipo_variable_phi", scale, 0, few_distractors)
+            for scale in (0.001, 0.01, 0.03, 0.1, 0.3, 0.5)
+        ),
+    ]
+
+
+def closed_form_cells(domain_counts: Iterable[int], dim_distractor: int) -> list[Cell]:
+    """The minimum-norm gain, which is not trained."""
+    return [
+        Cell("minimum_norm", n_d, dim_distractor, None, precision="float64")
+        for n_d in sorted(domain_counts)
+    ]
+
+
+def optimizer_cells(
+    domain_counts: Sequence[int], dim_distractor: int, num_iterations: int
+) -> list[Cell]:
+    """Plain steps and L-BFGS, in double precision, until (nearly) nothing moves any more.
+
+    IPO's average moves by learning_rate / n_d times the mean gradient in a round, so n_d times
+    the learning rate makes it comparable with gradient descent.
+    """
+    scale = num_iterations / 5000
+    plain = {"optimizer": "plain", "num_iterations": round(10_000 * scale)}
+    lbfgs = {"optimizer": "lbfgs", "num_iterations": round(150 * scale) + 1}
+
+    def converged(method: str, n_d: int, **changes: Any) -> Cell:
+        settings = replace(published(method), **changes)
+        return Cell(method, n_d, dim_distractor, settings, precision="float64")
+
+    return [
+        cell
+        for n in domain_counts
+        for cell in (
+            converged("gradient_descent", n, learning_rate=0.1, max_gradient_norm=5.0, **plain),
+            converged(
+                "ipo_fixed_phi", n, learning_rate=0.1 * n, max_gradient_norm=5.0 / n, **plain
+            ),
+            converged("gradient_descent", n, learning_rate=1.0, **lbfgs),
+        )
+    ]
+
+
+def control_cells(
+    domain_counts: Sequence[int], dim_distractor: int, num_iterations: int
+) -> list[Cell]:
+    """One change at a time: learning rate, number of steps, early stopping, weight decay."""
+
+    def control(method: str, n_d: int, suffix: str, early: bool = False, **changes: Any) -> Cell:
+        cell = published_cell(method, n_d, dim_distractor, num_iterations)
+        settings = replace(cell.settings, **changes)
+        return replace(cell, label=f"{method}_{suffix}", settings=settings, early_stopping=early)
+
+    return [
+        cell
+        for n in domain_counts
+        for cell in (
+            control("gradient_descent", n, "lr5e-4", learning_rate=5e-4),
+            control("gradient_descent", n, "long", num_iterations=n * num_iterations),
+            control("gradient_descent", n, "early", early=True),
+            control("gradient_descent", n, "wd0.1", weight_decay=0.1),
+            control("gradient_descent", n, "wd1", weight_decay=1.0),
+            control("ipo_fixed_phi", n, "lr1e-3", learning_rate=1e-3),
+            control("ipo_fixed_phi", n, "early", early=True),
+            control("ipo_fixed_phi", n, "wd0.1", weight_decay=0.1),
+            control("ipo_fixed_phi", n, "wd1", weight_decay=1.0),
+        )
+    ]
+
+
+# ------------------------------------------------------------------- from a cell to rows
+
+
 def run_cell(cell: Cell, seeds: list[int]) -> pd.DataFrame:
     """Train all runs of a cell and evaluate the controllers that they end with.
 
@@ -83,8 +202,61 @@ def run_curve(cell: Cell, seeds: list[int], num_points: int = 40) -> pd.DataFram
     return pd.concat(parts, ignore_index=True)
 
 
+def run_closed_loops(
+    cell: Cell, seeds: list[int], num_starts: int = 200, num_steps: int = 25
+) -> pd.DataFrame:
+    """How long the state is, ``|s_t|^2``, in a new domain: quantiles over random starts, by step.
+
+    The starts are the same in all runs. The oracle is the invariant controller.
+    """
+    problem = _problem(cell, seeds)
+    gain = final_gain(cell, problem, seeds)
+    starts = torch.randn(
+        num_starts, problem.A.shape[-1], generator=torch.Generator().manual_seed(0)
+    )
+    energies = torch.stack(
+        [
+            simulate(gain, problem, problem.W_test, start.expand(len(seeds), -1), num_steps)
+            for start in starts
+        ]
+    )
+    quantiles = np.quantile(energies.square().sum(-1).numpy(), [0.05, 0.5, 0.95], axis=0)
+    names = ("energy_q05", "energy_q50", "energy_q95")
+    parts = []
+    for step in range(num_steps + 1):
+        metrics = {("test", name): q[:, step] for name, q in zip(names, quantiles, strict=True)}
+        parts.append(tidy(cell, seeds, metrics, step=step))
+    return pd.concat(parts, ignore_index=True)
+
+
+def run_outside(cell: Cell, seeds: list[int]) -> pd.DataFrame:
+    """Where the part of a gain lies that no training domain can show, and what it costs there.
+
+    ``test_cost_random_outside`` is the cost with a random part of the same norm in its place.
+    """
+    problem = _problem(cell, seeds)
+    gain = final_gain(cell, problem, seeds)
+    basis = row_space(problem)
+    outside = gain - project(gain, basis)
+    other = torch.randn(gain.shape, generator=torch.Generator().manual_seed(0))
+    other -= project(other, basis)
+    other *= (_norm(outside) / _norm(other))[:, None, None]
+    metrics = {
+        ("all", "gain_norm_outside"): _norm(outside),
+        ("all", "gain_norm_outside_state"): _norm(outside[..., : problem.A.shape[-1]]),
+        ("test", "gain_norm_outside_felt"): _norm(outside @ problem.W_test),
+        ("test", "test_cost"): expected_cost(gain, problem, problem.W_test),
+        ("test", "test_cost_random_outside"): expected_cost(
+            gain - outside + other, problem, problem.W_test
+        ),
+    }
+    return tidy(cell, seeds, metrics)
+
+
 def final_gain(cell: Cell, problem: LQR, seeds: list[int]) -> Tensor:
     """The controllers ``[R, n_u, n_o]`` of a cell."""
+    if cell.label == "oracle":
+        return invariant_gain(problem)
     if cell.label == "minimum_norm":
         return minimum_norm_gain(problem)
     if cell.early_stopping:
@@ -154,4 +326,8 @@ def short(cell: Cell) -> Cell:
 EXPERIMENTS = {
     name: Experiment(run_cell, Cell, short)
     for name in ("tables", "starts", "more_domains", "closed_form", "optimizers", "controls")
-} | {"curves": Experiment(run_curve, Cell, short)}
+} | {
+    "curves": Experiment(run_curve, Cell, short),
+    "closed_loops": Experiment(run_closed_loops, Cell, short),
+    "outside": Experiment(run_outside, Cell, short),
+}
