@@ -12,7 +12,10 @@ import torch
 from torch import Tensor
 
 from experiments.experiment import Experiment
+from experiments.figures import label
 from experiments.rows import tidy
+from experiments.store import select
+from experiments.tables import mean_and_std
 from ipo.checks import check_count
 from ipo.game import nash_gap
 from ipo.lqr import (
@@ -28,6 +31,7 @@ from ipo.lqr import (
     training_costs,
 )
 from ipo.lqr_learners import METHODS, Settings, published, train
+from ipo.stats import paired_difference, probability_of_improvement
 
 VALIDATION_INTERVAL = 20  # iterations between two looks at the held-out domain
 
@@ -75,13 +79,18 @@ def published_cell(
     return Cell(method, num_domains, dim_distractor, settings)
 
 
+def published_cells(num_domains: int, dim_distractor: int, num_iterations: int) -> list[Cell]:
+    """The four methods."""
+    return [published_cell(m, num_domains, dim_distractor, num_iterations) for m in METHODS]
+
+
 def table_cells(sizes: Iterable[tuple[int, int]], num_iterations: int) -> list[Cell]:
     """The four methods and the oracle, for pairs of n_d and n_y."""
     return [
         cell
         for size in sizes
         for cell in (
-            *(published_cell(method, *size, num_iterations) for method in METHODS),
+            *published_cells(*size, num_iterations),
             Cell("oracle", *size, settings=None),
         )
     ]
@@ -331,3 +340,192 @@ EXPERIMENTS = {
     "closed_loops": Experiment(run_closed_loops, Cell, short),
     "outside": Experiment(run_outside, Cell, short),
 }
+
+
+# ------------------------------------------------------------------- from rows to tables
+
+CONTROLS = {
+    "gradient_descent": "gradient descent, as published",
+    "gradient_descent_lr5e-4": "… IPO's learning rate",
+    "gradient_descent_long": "… as many steps as IPO's players",
+    "gradient_descent_early": "… early stopping",
+    "gradient_descent_wd0.1": "… weight decay 0.1",
+    "gradient_descent_wd1": "… weight decay 1",
+    "ipo_fixed_phi": "IPO, fixed Φ, as published",
+    "ipo_fixed_phi_lr1e-3": "… gradient descent's learning rate",
+    "ipo_fixed_phi_early": "… early stopping",
+    "ipo_fixed_phi_wd0.1": "… weight decay 0.1",
+    "ipo_fixed_phi_wd1": "… weight decay 1",
+}
+PAIRS = {
+    ("ipo_fixed_phi", "gradient_descent"): "IPO − gradient descent",
+    ("ipo_fixed_phi", "gradient_descent_lr5e-4"): "IPO − gradient descent, 5e-4",
+    ("ipo_fixed_phi", "gradient_descent_early"): "IPO − gradient descent, early stopping",
+    ("ipo_fixed_phi_lr1e-3", "gradient_descent"): "IPO, 1e-3 − gradient descent",
+    ("ipo_fixed_phi_early", "gradient_descent_early"): (
+        "IPO, early stopping − gradient descent, early stopping"
+    ),
+}
+OPTIMIZERS = {"adam": "Adam", "plain": "plain", "lbfgs": "L-BFGS", "none": "–"}
+
+
+def beside_paper(rows: pd.DataFrame, paper: pd.DataFrame, by: str, **fixed: int) -> pd.DataFrame:
+    """Cost in a new domain by ``by``, the other size ``fixed``: ours, the paper's, the difference.
+
+    Mean and standard deviation over runs; nothing where the paper has no number.
+    """
+    keys = ["method", by]
+    ours = select(rows, {"metric": "test_cost", **fixed}).groupby(keys)["value"]
+    theirs = select(paper, fixed).drop_duplicates(keys).set_index(keys)
+    theirs = theirs.reindex(ours.mean().index)
+    text = pd.DataFrame(
+        {
+            "ours": ours.agg(mean_and_std),
+            "paper": [_published(*row) for row in theirs[["mean", "std"]].to_numpy()],
+            "difference": (ours.mean() - theirs["mean"]).map("{:+.2f}".format, na_action="ignore"),
+        }
+    )
+    wide = text.fillna("").stack().unstack(by)
+    order = [(method, row) for method in (*METHODS, "oracle") for row in text.columns]
+    wide = wide.loc[order]
+    wide.index = pd.MultiIndex.from_tuples([(label(method), row) for method, row in order])
+    unit = "domains" if by == "num_domains" else "distractors"
+    wide.columns = [f"{n} {unit}" for n in wide.columns]
+    return wide
+
+
+def _published(mean: float, std: float) -> str:
+    if np.isnan(mean):
+        return ""
+    return f"{mean:.1f}" if np.isnan(std) else f"{mean:.1f} ± {std}"
+
+
+def difference_to_paper(rows: pd.DataFrame, paper: pd.DataFrame) -> pd.Series:
+    """Mean cost in a new domain minus the paper's, per cell of the two tables."""
+    keys = ["method", "num_domains", "dim_distractor"]
+    ours = rows[rows["metric"] == "test_cost"].groupby(keys)["value"].mean()
+    return (ours - paper.drop_duplicates(keys).set_index(keys)["mean"]).dropna()
+
+
+def in_words(differences: pd.Series) -> str:
+    """Which cells of the tables differ from the paper's, and by how much."""
+    parts = [
+        f"{label(method)} with {n_d} domains and {n_y} distractors, by {difference:+.1f}"
+        for (method, n_d, n_y), difference in differences.items()
+    ]
+    return "; ".join(parts) or "none"
+
+
+def start_table(rows: pd.DataFrame, cells: Sequence[Cell], paper: pd.DataFrame) -> pd.DataFrame:
+    """Cost in a new domain by the start of Phi, and which start the tables have."""
+    keys = ["method", "dim_distractor"]
+    costs = rows[rows["metric"] == "test_cost"].groupby(keys)["value"].agg(mean_and_std)
+
+    def row(cell: Cell) -> dict[str, Any]:
+        start, n_d, n_y = cell.settings, cell.num_domains, cell.dim_distractor
+        chosen = published_cell(start.method, n_d, n_y, start.num_iterations).settings
+        place = {"method": start.method, "num_domains": n_d, "dim_distractor": n_y}
+        theirs = select(paper, place)["mean"]
+        return {
+            "method": label(start.method),
+            "distractors": n_y,
+            "scale of Φ or K₁": f"{start.phi_scale:g}",
+            "scale of Kᵈ or K₂": f"{start.gain_scale:g}",
+            "cost in a new domain": costs[cell.label, n_y],
+            "paper": f"{theirs.iloc[0]:.1f}" if len(theirs) else "",
+            "in the tables": "✓" if start == chosen else "",
+        }
+
+    return pd.DataFrame(map(row, cells))
+
+
+def means(rows: pd.DataFrame, metric: str) -> pd.DataFrame:
+    """Means over runs: a row per method, a column per number of domains."""
+    return (
+        rows[rows["metric"] == metric].groupby(["method", "num_domains"])["value"].mean().unstack()
+    )
+
+
+def optimizer_table(rows: pd.DataFrame) -> pd.DataFrame:
+    """Means over runs by optimiser, method and number of domains."""
+    wanted = {
+        "test_cost": "cost in a new domain",
+        "test_cost_projected": "… projected onto the row space",
+        "gain_norm_inside": "norm inside",
+        "gain_norm_outside": "norm outside",
+        "distance_to_minimum_norm": "distance to minimum norm",
+    }
+    keys = ["optimizer", "method", "num_domains"]
+    table = rows.groupby([*keys, "metric"])["value"].mean().unstack()
+    order = {name: place for place, name in enumerate([*OPTIMIZERS, *METHODS, "minimum_norm"])}
+    table = table.sort_index(key=lambda level: level.map(lambda name: order.get(name, name)))
+    table = table[list(wanted)].rename(columns=wanted).rename_axis(columns=None)
+    table = table.rename(index=OPTIMIZERS, level="optimizer").rename(index=label, level="method")
+    return table.reset_index(names=["optimiser", "method", "domains"])
+
+
+def optimizer_numbers(rows: pd.DataFrame, num_domains: int) -> dict[str, float | str]:
+    """Numbers for the prose: means over runs with ``num_domains``.
+
+    ``plain_vs_closed`` is the largest relative difference in cost, with any number of domains,
+    between a run that converged and the closed form.
+    """
+    keys = ["optimizer", "method"]
+    mean = select(rows, {"num_domains": num_domains}).groupby([*keys, "metric"])["value"].mean()
+    values = {
+        "lbfgs": mean["lbfgs", "gradient_descent", "test_cost"],
+        "closed": mean["none", "minimum_norm", "test_cost"],
+    }
+    for method in ("gradient_descent", "ipo_fixed_phi"):
+        values[f"adam_{method}"] = mean["adam", method, "test_cost"]
+        values[f"plain_{method}"] = mean["plain", method, "test_cost"]
+        values[f"projected_{method}"] = mean["adam", method, "test_cost_projected"]
+        values[f"outside_{method}"] = mean["adam", method, "gain_norm_outside"]
+    costs = rows[rows["metric"] == "test_cost"].set_index(["num_domains", "run"])
+    closed = costs.loc[costs["method"] == "minimum_norm", "value"]
+    converged = costs.loc[costs["optimizer"].isin(["plain", "lbfgs"]), "value"]
+    return values | {"plain_vs_closed": f"{(converged / closed - 1).abs().max():.0e}"}
+
+
+def outside_table(rows: pd.DataFrame) -> pd.DataFrame:
+    """Means over runs: where the part outside the row space lies, and what it costs."""
+    names = {
+        "gain_norm_outside": "norm outside",
+        "gain_norm_outside_state": "… in columns of the state",
+        "gain_norm_outside_felt": "… as a new domain feels it",
+        "test_cost": "cost in a new domain",
+        "test_cost_random_outside": "… with a random outside part",
+    }
+    table = rows.groupby(["method", "metric"])["value"].mean().unstack()
+    table = table.loc[list(METHODS), list(names)].rename(index=label, columns=names)
+    return table.rename_axis(columns=None).reset_index()
+
+
+def control_table(rows: pd.DataFrame) -> pd.DataFrame:
+    """Cost in a new domain of every control, by the number of training domains."""
+    chosen = rows[rows["metric"] == "test_cost"].groupby(["method", "num_domains"])["value"]
+    table = chosen.agg(mean_and_std).unstack().loc[list(CONTROLS)].rename(index=CONTROLS)
+    table.columns = [f"{n} domains" for n in table.columns]
+    return table.rename_axis(index=None)
+
+
+def control_differences(rows: pd.DataFrame) -> pd.DataFrame:
+    """Paired differences of cost in a new domain, run by run."""
+    rng = np.random.default_rng(0)
+    by_run = rows[rows["metric"] == "test_cost"].pivot_table(
+        index=["num_domains", "run"], columns="method", values="value"
+    )
+
+    def row(n: int, block: pd.DataFrame, method: str, baseline: str) -> dict[str, Any]:
+        mean, low, high = paired_difference(block[method], block[baseline], rng)
+        better = probability_of_improvement(block[method], block[baseline])
+        return {
+            "difference": PAIRS[method, baseline],
+            "domains": n,
+            "mean and 95 % interval": f"{mean:+.1f} [{low:+.1f}, {high:+.1f}]",
+            "P(improvement)": f"{better:.2f}",
+        }
+
+    blocks = by_run.groupby(level=0)
+    table = pd.DataFrame([row(n, block, *pair) for n, block in blocks for pair in PAIRS])
+    return table.sort_values(["difference", "domains"], kind="stable")
