@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from experiments import lqr
-from experiments.store import Store, asked
+from experiments.store import Store, asked, filled
 
 DATA = Path(__file__).resolve().parents[2] / "data"
 RESULTS = DATA / "results" / "lqr"
@@ -78,9 +78,12 @@ def test_every_cell_has_ten_runs(costs):
 
 @pytest.mark.parametrize("name", lqr.EXPERIMENTS)
 def test_rows_are_whole_and_what_the_chapter_asks_for(name):
-    cells, num_runs = ASKED[name]
-    wanted = [asked(lqr.EXPERIMENTS[name], cell, range(num_runs)) for cell in cells]
+    experiment, (cells, num_runs) = lqr.EXPERIMENTS[name], ASKED[name]
+    wanted = [asked(experiment, cell, range(num_runs)) for cell in cells]
     batches = Store(RESULTS, name).batches()  # checks every row
-    recorded = [{key: batch[key] for key in wanted[0]} for batch in batches]
+    recorded = [
+        {key: batch[key] for key in wanted[0]} | {"cell": filled(experiment, batch["cell"])}
+        for batch in batches
+    ]
     assert sorted(map(json.dumps, recorded)) == sorted(map(json.dumps, wanted))
     assert [batch["seeds"] for batch in batches] == [list(range(num_runs))] * len(cells)
