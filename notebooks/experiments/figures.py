@@ -221,18 +221,36 @@ def network_graph(
     return nodes, edges
 
 
-def trajectories(energies: dict[str, np.ndarray], oracle: str) -> Figure:
-    """``|s_t|^2`` over time for several starts: ``{method: [starts, time]}``, median and range."""
+def trajectories(rows: pd.DataFrame, oracle: str) -> Figure:
+    """``|s_t|^2`` over time by method: quantiles ``energy_q05, _q50, _q95`` over starts."""
     fig, ax = plt.subplots(figsize=(7, 3.8))
-    for method, energy in energies.items():
+    for method, energy in rows.groupby("method", sort=False):
         name, color, _ = STYLES[method]
-        steps = np.arange(energy.shape[1])
-        low, middle, high = np.quantile(energy, [0.05, 0.5, 0.95], axis=0)
+        low, middle, high = energy.pivot(index="metric", columns="step", values="value").to_numpy()
+        steps = np.arange(len(middle))
         ax.plot(steps, middle, color=color, label=name, ls="--" if method == oracle else "-")
         ax.fill_between(steps, low, high, color=color, alpha=0.15, lw=0)
     ax.set(yscale="log", xlabel="time step", ylabel="$|s_t|^2$", ylim=(1e-6, None))
     ax.legend()
     return fig
+
+
+def draw_optimizers(ax: Axes, points: pd.DataFrame, x: str, y: str) -> None:
+    """Every run as a point: a colour per method, a mark per optimiser.
+
+    Runs with plain steps and L-BFGS have large hollow marks and crosses, for they may coincide.
+    """
+    for (method, optimizer), runs in points.groupby(["method", "optimizer"]):
+        name, color, marker = STYLES[method]
+        hollow = {"marker": marker, "facecolors": "none", "edgecolors": color}
+        look = {
+            "adam": {"s": 22, "marker": marker, "facecolors": color, "alpha": 0.8},
+            "none": {"s": 18, "marker": marker, "facecolors": color},
+            "plain": {"s": 110, **hollow},
+            "lbfgs": {"s": 110, "marker": "x", "color": color, "lw": 1},
+        }[optimizer]
+        suffix = {"adam": ", Adam", "none": "", "plain": ", plain", "lbfgs": ", L-BFGS"}[optimizer]
+        ax.scatter(runs[x], runs[y], label=name + suffix, **look)
 
 
 def causal_graph(
