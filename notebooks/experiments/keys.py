@@ -411,13 +411,10 @@ def by_update(both: pd.DataFrame) -> pd.DataFrame:
     return means.assign(**{"largest difference": largest})
 
 
-def gap(
-    rows: pd.DataFrame, method: str, baseline: str, rng: np.random.Generator
-) -> tuple[float, str]:
-    """Difference of the exact returns on grey, paired by run, and its 95 % interval in words."""
-    values, base = (runs_of(rows, name, TESTED) for name in (method, baseline))
-    mean, low, high = paired_difference(values, base, rng)
-    return mean, f"[{low:+.3f}, {high:+.3f}]"
+def gap(rows: pd.DataFrame, method: str, baseline: str, rng: np.random.Generator) -> str:
+    """Difference of the exact returns on grey, paired by run, with its 95 % interval, in words."""
+    mean, low, high = paired_difference(*_on_grey(rows, method, baseline), rng)
+    return f"{mean:+.3f} [{low:+.3f}, {high:+.3f}]"
 
 
 def comparison(
@@ -426,18 +423,23 @@ def comparison(
     """Exact returns on grey of pairs of arms: a row for each method and its baseline."""
 
     def row(method: str, baseline: str) -> dict[str, Any]:
-        values, base = (runs_of(rows, name, TESTED) for name in (method, baseline))
-        mean, interval = gap(rows, method, baseline, rng)
+        values, base = _on_grey(rows, method, baseline)
+        mean, low, high = paired_difference(values, base, rng)
         return {
             "difference on grey": f"{MAIN[method]} − {MAIN[baseline]}",
             "mean": mean,
-            "95 % interval": interval,
+            "95 % interval": f"[{low:+.3f}, {high:+.3f}]",
             # The function is for costs, where less is better.
             "P(improvement)": probability_of_improvement(-values, -base),
             "p (Welch)": scipy.stats.ttest_ind(values, base, equal_var=False).pvalue,
         }
 
     return pd.DataFrame([row(*pair) for pair in pairs])
+
+
+def _on_grey(rows: pd.DataFrame, *methods: str, metric: str = "return_exact") -> list[pd.Series]:
+    """Values of all runs of some arms in the test domain."""
+    return [runs_of(rows, method, TESTED, metric) for method in methods]
 
 
 def draws_of_ten(
@@ -459,14 +461,14 @@ def runs_needed(rows: pd.DataFrame, difference: float) -> int:
 
     n = 2 s^2 ((z_0.975 + z_0.8) / difference)^2,    s^2: variance over runs, mean of both arms
     """
-    variance = (runs_of(rows, "ipo", TESTED).var() + runs_of(rows, "ppo", TESTED).var()) / 2
+    variance = np.mean([values.var() for values in _on_grey(rows, "ipo", "ppo")])
     z = scipy.stats.norm.ppf([0.975, 0.8]).sum()
     return int(np.ceil(2 * variance * (z / difference) ** 2))
 
 
 def p_of_spreads(rows: pd.DataFrame, metric: str) -> float:
     """Brown-Forsythe test of whether IPO and PPO vary equally on grey."""
-    pair = [runs_of(rows, method, TESTED, metric) for method in ("ipo", "ppo")]
+    pair = _on_grey(rows, "ipo", "ppo", metric=metric)
     return scipy.stats.levene(*pair, center="median").pvalue
 
 
