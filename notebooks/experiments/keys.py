@@ -403,12 +403,17 @@ def beside(shipped: pd.DataFrame, rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def by_update(both: pd.DataFrame) -> pd.DataFrame:
-    """What :func:`beside` found on learning curves: means over runs at each number of frames."""
-    values = both.rename(columns={"value_shipped": "shipped", "value": "live"})
-    means = values.pivot_table(["shipped", "live"], ["method", "frames"], "domain")
-    means.columns = [f"{color}, {what}" for what, color in means.columns]
-    largest = both.groupby(["method", "frames"])["difference"].max()
-    return means.assign(**{"largest difference": largest})
+    """What :func:`beside` found on learning curves of :data:`MAIN`: by arm and number of frames.
+
+    Means over runs, shipped and live, and the largest difference of any run.
+    """
+    columns = {}
+    means = both.groupby(["domain", "method", "frames"])[["value_shipped", "value"]].mean()
+    for color in both["domain"].unique():
+        columns[f"{color}, shipped"] = means.loc[color]["value_shipped"]
+        columns[f"{color}, live"] = means.loc[color]["value"]
+    columns["largest difference"] = both.groupby(["method", "frames"])["difference"].max()
+    return pd.DataFrame(columns).rename(index=MAIN).rename_axis(["arm", "frames"]).reset_index()
 
 
 def gap(rows: pd.DataFrame, method: str, baseline: str, rng: np.random.Generator) -> str:
