@@ -6,6 +6,7 @@ import base64
 import html
 import importlib
 import io
+import itertools
 import weakref
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -21,6 +22,7 @@ from matplotlib.figure import Figure
 
 from ipo.checks import check_choice
 from ipo.worlds.door import DoorParams, build_door, shift_handle
+from ipo.worlds.tabular import TabularTask, state_of
 
 
 def record(
@@ -35,6 +37,14 @@ def record(
         if terminated or truncated:
             break
     return frames
+
+
+def record_on_table(
+    env: Env, table: TabularTask, act: Callable[[int, int], int], seed: int
+) -> list[np.ndarray]:
+    """:func:`record` of ``act(step, state) -> action``, where the table counts the states."""
+    steps = itertools.count()
+    return record(env, lambda _: int(act(next(steps), state_of(table, env))), seed)
 
 
 def film_strip(
