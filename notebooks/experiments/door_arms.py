@@ -63,6 +63,11 @@ def of_arm(rows: pd.DataFrame, cell: Cell, friction: float | None = None) -> pd.
     return chosen if friction is None else chosen[chosen["domain"] == str(friction)]
 
 
+def cell_of(row: pd.Series, arms: Mapping[str, Cell]) -> Cell:
+    """The arm that a row belongs to."""
+    return next(cell for cell in arms.values() if dict(row[list(cell.columns)]) == cell.columns)
+
+
 def rate(rows: pd.DataFrame, cell: Cell, friction: float) -> pd.Series:
     """Part of the doors opened, by run."""
     return of_arm(rows, cell, friction).groupby("run")["value"].mean()

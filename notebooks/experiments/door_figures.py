@@ -20,7 +20,7 @@ from experiments.door import (
     most_likely,
     scripted,
 )
-from experiments.door_arms import NAMES, PUBLISHED, rate
+from experiments.door_arms import NAMES, PUBLISHED, cell_of, rate
 from experiments.door_training import CURVE_FRICTION, TRAIN_FRICTIONS
 from experiments.door_ways import STRATEGIES, TRAITS, success_by_lever, trait_correlations
 from ipo.worlds.door import GEAR, DoorEnv
@@ -105,10 +105,7 @@ def strategy_sheet(
     for ax in axes.flat:
         ax.axis("off")
     for line, row in zip(axes, examples, strict=False):
-        cell = next(
-            cell for cell in arms.values() if (row[list(cell.columns)] == cell.columns).all()
-        )
-        act = most_likely(load_players(cell, row["run"], policies))
+        act = most_likely(load_players(cell_of(row, arms), row["run"], policies))
         env = DoorEnv(friction=float(row["domain"]))
         episode = play(env, door_seeds(row["door"] + 1)[-1], act)
         length = len(episode.joints)

@@ -9,7 +9,7 @@ import scipy.stats
 
 from experiments import door_figures, door_tables, door_training, door_ways, pictures
 from experiments.door import door_seeds, evaluation_doors
-from experiments.door_arms import arms_of, mean_rate, rate, rate_by_friction, trainings
+from experiments.door_arms import arms_of, cell_of, mean_rate, rate, rate_by_friction, trainings
 from experiments.door_training import NETWORK, policy_path
 from ipo.networks import save_policy
 from ipo.worlds.door import DoorEnv
@@ -83,6 +83,7 @@ def test_an_arm_has_its_own_rows_only(success):
     assert list(rate(success, ARMS["ppo"], 1.5)) == [0] * 3
     assert list(mean_rate(success, ARMS["ppo"], FRICTIONS)) == [0.25] * 3
     assert list(rate(success, ARMS["ipo_half"], 1.5)) == [0.5, 0.5, 0.75]
+    assert [cell_of(row, ARMS) for _, row in success.iloc[::24].iterrows()] == [*ARMS.values()]
     last = replace(ARMS["ipo"], choice="last")
     assert rate(success, last, 1.1).empty
 
