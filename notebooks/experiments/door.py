@@ -137,7 +137,8 @@ def door_seeds(num_doors: int = NUM_DOORS) -> list[int]:
 def evaluation_doors(num_doors: int = NUM_DOORS) -> pd.DataFrame:
     """What the doors of the evaluation are like: a row for each, without its friction.
 
-    The columns are those of ``DoorParams``, ``lever_arm``, and the handle's shift.
+    The columns are those of ``DoorParams``, ``lever_arm``, the handle's shift, and ``lever``: from
+    the hinge to the shifted handle.
     """
     rows = []
     for seed in door_seeds(num_doors):
@@ -145,7 +146,8 @@ def evaluation_doors(num_doors: int = NUM_DOORS) -> pd.DataFrame:
         env.reset(seed=seed)
         y, z = env.handle_shift
         lever_arm = env.params.lever_arm
-        rows.append(asdict(env.params) | {"lever_arm": lever_arm, "shift_y": y, "shift_z": z})
+        levers = {"lever_arm": lever_arm, "lever": lever_arm - y}
+        rows.append(asdict(env.params) | levers | {"shift_y": y, "shift_z": z})
     return pd.DataFrame(rows).drop(columns="friction").rename_axis("door").reset_index()
 
 

@@ -67,6 +67,19 @@ def film_strip(
     return fig
 
 
+def titled(
+    pictures: Sequence[tuple[str, np.ndarray]], num_rows: int, size: tuple[float, float]
+) -> Figure:
+    """Pictures with their titles, in rows of the same length."""
+    fig, axes = plt.subplots(num_rows, -(-len(pictures) // num_rows), figsize=size, squeeze=False)
+    for ax in axes.flat:
+        ax.axis("off")
+    for ax, (title, picture) in zip(axes.flat, pictures, strict=False):
+        ax.imshow(picture)
+        ax.set_title(title, fontsize=9)
+    return fig
+
+
 def side_by_side(episodes: Sequence[Sequence[np.ndarray]], gap: int = 8) -> list[np.ndarray]:
     """One film of several: those that are over stand still on their last frame."""
     length = max(map(len, episodes))
@@ -163,6 +176,27 @@ class DoorPicture:
 
 class RenderError(RuntimeError):
     """No pictures can be drawn on this machine."""
+
+
+class Blank:
+    """What stands where a door cannot be drawn."""
+
+    def __init__(self, width: int, height: int) -> None:
+        self.picture = np.full((height, width, 3), 220, np.uint8)
+
+    def frame(self, *_: Any) -> np.ndarray:
+        return self.picture
+
+
+def camera(
+    params: DoorParams, view: str = "handle", width: int = 240, height: int = 180
+) -> DoorPicture | Blank:
+    """Draws a door; without OpenGL, says what to install and goes on without pictures."""
+    try:
+        return DoorPicture(params, width, height, view)
+    except RenderError as error:
+        print(error)
+        return Blank(width, height)
 
 
 def _free(context: Any, opengl: mujoco.MjrContext) -> None:
