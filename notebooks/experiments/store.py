@@ -28,7 +28,7 @@ from filelock import FileLock
 from tqdm import tqdm
 
 from experiments import origin
-from experiments.experiment import Cell, Experiment
+from experiments.experiment import Cell, Experiment, rebuilt
 from experiments.files import replace_text
 from ipo.checks import check_counts
 
@@ -171,7 +171,7 @@ class Store:
         if not chosen:
             return
         wanted = asked(experiment, cell, chosen)
-        recorded = {key: batch[key] for key in wanted}
+        recorded = {key: batch[key] for key in wanted} | {"cell": filled(experiment, batch["cell"])}
         recorded["reads"] = {
             name: read for name, read in batch["reads"].items() if name in wanted["reads"]
         }
@@ -214,11 +214,12 @@ class Store:
             together = pd.concat([present, rows]) if len(present) else rows
             together = together.sort_values(order, kind="stable")[list(rows.columns)]
             if not self.json.exists():  # a CSV without a JSON would be somebody else's
-                self._write_record(rows, [])
+                self.write_record(rows, [])
             replace_text(self.csv, together.to_csv(index=False))
-            self._write_record(together, batches)
+            self.write_record(together, batches)
 
-    def _write_record(self, rows: pd.DataFrame, batches: list[Batch]) -> None:
+    def write_record(self, rows: pd.DataFrame, batches: list[Batch]) -> None:
+        """Replace the record of these rows."""
         types = {column: _type(rows[column]) for column in rows.columns}
         record = {"types": types, "batches": batches}
         replace_text(self.json, json.dumps(record, indent=1) + "\n")
@@ -251,6 +252,14 @@ def asked(experiment: Experiment, cell: Cell, seeds: Sequence[int]) -> dict[str,
     digests = {path.name: origin.file_digest(path) for path in paths}
     made_of = {"cell": asdict(cell), "run": name, "options": options, "reads": digests}
     return json.loads(json.dumps(made_of))
+
+
+def filled(experiment: Experiment, recorded: dict[str, Any]) -> dict[str, Any]:
+    """A recorded cell with options that it did not have yet: their defaults are what was done."""
+    try:
+        return json.loads(json.dumps(asdict(rebuilt(experiment.cell, recorded))))
+    except (TypeError, ValueError, KeyError):  # it has options that are no more
+        return recorded
 
 
 def select(rows: pd.DataFrame, columns: dict[str, Any]) -> pd.DataFrame:

@@ -75,10 +75,11 @@ def verify(chapters: Sequence[str] = tuple(CHAPTERS), num_workers: int = -1) -> 
     """What differs between the recorded slices and those of today's code, in words."""
     chosen = list(slices(chapters))
     problems = [
-        f"{chapter}/{name}: no slice is recorded"
+        f"{chapter}/{name}, {cell.columns}: no slice is recorded"
         for chapter in chapters
-        for name, experiment in CHAPTERS[chapter].items()
-        if not any((s.chapter, s.name) == (chapter, name) for s in chosen)
+        for name in CHAPTERS[chapter]
+        for cell in short_cells(chapter, name)
+        if cell.columns not in [s.batch["columns"] for s in chosen if s.name == name]
     ]
     with TemporaryDirectory() as scratch:
         jobs = (joblib.delayed(_attempt)(part, Path(scratch)) for part in chosen)
