@@ -36,7 +36,7 @@ def trainings(num_updates: int, num_steps: int) -> dict[str, door_training.Cell]
     return {
         method: door_training.Cell(
             method,
-            door_training.published(method, **changes),
+            door_training.published_door(method, **changes),
             saved_after=(num_updates // 2, num_updates),
             curve_every=max(num_updates // 19, 1),
         )

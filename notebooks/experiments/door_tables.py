@@ -25,7 +25,7 @@ from experiments.door_arms import (
     percent_with_interval,
     rate,
 )
-from experiments.door_training import CURVE_FRICTION, EVALUATION_SEED, TRAIN_FRICTIONS, opened
+from experiments.door_training import CURVE_FRICTION, EVALUATION_SEED, TRAIN_FRICTIONS
 from ipo.stats import paired_difference, probability_of_improvement
 
 PAIRS = {

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import resource
 import statistics
 import time
@@ -133,8 +132,7 @@ def main() -> None:
     print(f"Memory at its peak: {memory:.2f} GiB")
     if options.json:
         numbers = {"speeds": speeds, "update_cpu_seconds": costs, "memory_gib": memory}
-        replace_text(options.json, json.dumps(numbers, indent=1) + "
-")
+        replace_text(options.json, json.dumps(numbers, indent=1) + "\n")
 
 
 if __name__ == "__main__":

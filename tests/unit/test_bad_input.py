@@ -11,8 +11,9 @@ import pytest
 import torch
 from small import paper_problem, trained_gain
 
+from experiments.experiment import Experiment
 from experiments.lqr import Cell, run_cell
-from experiments.store import run_or_load
+from experiments.store import Store
 from ipo.checks import check_notebook_parameters
 from ipo.lqr import sample_problem, simulate
 from ipo.lqr_learners import LQRSettings, published_lqr
@@ -287,5 +288,5 @@ def test_results_without_proper_seeds(tmp_path, seeds, message):
 
     cell = Cell("oracle", 2, 20, None)
     with pytest.raises(ValueError, match=message):
-        run_or_load(tmp_path / "new", "rows", [cell], seeds, run, ["stats"])
+        Store(tmp_path / "new", "rows").fill(Experiment(run, Cell), [cell], seeds)
     assert list(tmp_path.iterdir()) == []

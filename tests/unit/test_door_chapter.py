@@ -11,7 +11,7 @@ from experiments import door_figures, door_tables, door_training, door_ways, pic
 from experiments.door import door_seeds, evaluation_doors
 from experiments.door_arms import arms_of, cell_of, mean_rate, rate, rate_by_friction, trainings
 from experiments.door_training import NETWORK, policy_path
-from ipo.networks import save_policy
+from experiments.policies import save_policy
 from ipo.worlds.door import DoorEnv
 
 FRICTIONS = (1.1, 1.5)

@@ -29,7 +29,8 @@ from experiments.keys import (
     runs_of,
 )
 from experiments.store import Batch, Store
-from ipo.networks import GridNetwork, load_policy
+from experiments.policies import load_policy
+from ipo.networks import GridNetwork, 
 from ipo.worlds.colored_keys import COLORS
 from ipo.worlds.tabular import TabularTask, expected_return, occupancy
 

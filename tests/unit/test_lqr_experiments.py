@@ -10,7 +10,7 @@ import torch
 from experiments import lqr
 from experiments.tables import beside_shipped
 from ipo.lqr import expected_cost, oracle_cost, project, row_space, sample_problem
-from ipo.lqr_learners import METHODS, published
+from ipo.lqr_learners import LQR_METHODS, published_lqr
 
 SEEDS = [0, 1]
 
@@ -76,7 +76,7 @@ def test_random_outside_part_has_the_same_norm_and_is_as_invisible():
 
 @pytest.mark.parametrize("cell", lqr.control_cells([5], 1000, 5000), ids=lambda cell: cell.label)
 def test_a_control_changes_one_thing(cell):
-    usual = published(cell.settings.method)
+    usual = published_lqr(cell.settings.method)
     changed = [f.name for f in fields(usual) if vars(usual)[f.name] != vars(cell.settings)[f.name]]
     assert len(changed) + cell.early_stopping == 1
 
@@ -98,7 +98,7 @@ def test_plain_ipo_moves_its_average_as_far_as_plain_gradient_descent():
 ROWS = pd.DataFrame(
     [
         (method, n_d, 1000, run, "test_cost", 40.0 + place + n_d + 2 * run)
-        for place, method in enumerate((*METHODS, "oracle"))
+        for place, method in enumerate((*LQR_METHODS, "oracle"))
         for n_d in (2, 3)
         for run in SEEDS
     ],
