@@ -100,7 +100,7 @@ def table_of_authors(
     saved = authors_policies(repository)
     jobs = [(m, str(f), players) for m in saved for f in tested for players in saved[m]]
     found = joblib.Parallel(n_jobs=num_workers)(
-        joblib.delayed(opened)(players, float(f), num_doors, EVALUATION_SEED)
+        joblib.delayed(last_info)(players, float(f), num_doors, EVALUATION_SEED)
         for _, f, players in jobs
     )
     parts = [part.mean() for part in found]
