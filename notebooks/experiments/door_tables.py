@@ -25,7 +25,7 @@ from experiments.door_arms import (
     percent_with_interval,
     rate,
 )
-from experiments.door_training import CURVE_FRICTION, EVALUATION_SEED, TRAIN_FRICTIONS
+from experiments.door_training import CURVE_FRICTION, EVALUATION_SEED, TRAIN_FRICTIONS, last_info
 from ipo.stats import paired_difference, probability_of_improvement
 
 PAIRS = {
@@ -103,7 +103,7 @@ def table_of_authors(
         joblib.delayed(last_info)(players, float(f), num_doors, EVALUATION_SEED)
         for _, f, players in jobs
     )
-    parts = [part.mean() for part in found]
+    parts = [info["opened"].mean() for info in found]
     rates = pd.Series(parts, pd.MultiIndex.from_tuples([job[:2] for job in jobs]))
     return pd.DataFrame(
         {"arm": f"{m.upper()}, the paper's policies, here"}
