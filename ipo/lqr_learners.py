@@ -182,20 +182,19 @@ def train(
     if len(seeds) != problem.num_runs:
         raise ValueError(f"seeds = {list(seeds)}: must be one for each of {problem.num_runs} runs")
     start = _checked_start(problem, settings, start)
-    learner = LEARNERS[settings.method]
+    make = LEARNERS[settings.method]
     if settings.optimizer == "lbfgs":  # its curvature model would mix the runs: one at a time
         learners = [
-            learner(problem.run(r), settings, start[r : r + 1], [seed])
-            for r, seed in enumerate(seeds)
+            make(problem.run(r), settings, start[r : r + 1], [seed]) for r, seed in enumerate(seeds)
         ]
     else:
-        learners = [learner(problem, settings, start, seeds)]
+        learners = [make(problem, settings, start, seeds)]
     _check_stable("start", torch.cat([learner.gain() for learner in learners]), problem)
 
     wanted = {*checkpoints, settings.num_iterations}
     for iteration in range(settings.num_iterations + 1):
         if iteration in wanted:
-            yield iteration, torch.cat([learner.gain() for learner in learners]).clone()
+            yield iteration, torch.cat([learner.gain() for learner in learners])
         if iteration < settings.num_iterations:
             for learner in learners:
                 learner.iterate()

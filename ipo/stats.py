@@ -20,11 +20,11 @@ def bootstrap_interval(values: Sequence[float], rng: np.random.Generator) -> tup
     Raises:
         ValueError: fewer than two runs, values that are not finite.
     """
-    values = _checked("values", values)
-    if np.ptp(values) == 0:  # every resample is the same; scipy would warn and return NaN
-        return float(values[0]), float(values[0])
+    runs = _checked("values", values)
+    if np.ptp(runs) == 0:  # every resample is the same; scipy would warn and return NaN
+        return float(runs[0]), float(runs[0])
     interval = scipy.stats.bootstrap(
-        (values,),
+        (runs,),
         np.mean,
         confidence_level=0.95,
         n_resamples=NUM_RESAMPLES,
@@ -39,12 +39,12 @@ def paired_difference(
     values: Sequence[float], baseline: Sequence[float], rng: np.random.Generator
 ) -> tuple[float, float, float]:
     """Mean of ``values - baseline`` run by run, with its 95 % bootstrap interval."""
-    values, baseline = _checked("values", values), _checked("baseline", baseline)
-    if len(values) != len(baseline):
+    runs, others = _checked("values", values), _checked("baseline", baseline)
+    if len(runs) != len(others):
         raise ValueError(
-            f"baseline has {len(baseline)} runs, must have {len(values)}, one for each value"
+            f"baseline has {len(others)} runs, must have {len(runs)}, one for each value"
         )
-    difference = values - baseline
+    difference = runs - others
     return float(difference.mean()), *bootstrap_interval(difference, rng)
 
 
@@ -53,8 +53,8 @@ def probability_of_improvement(costs: Sequence[float], baseline: Sequence[float]
 
     P(X < Y) + P(X = Y) / 2    over all pairs of runs (Mann-Whitney U / (n m))
     """
-    costs, baseline = _checked("costs", costs), _checked("baseline", baseline)
-    return float(np.mean((costs[:, None] < baseline) + 0.5 * (costs[:, None] == baseline)))
+    runs, others = _checked("costs", costs)[:, None], _checked("baseline", baseline)
+    return float(np.mean((runs < others) + 0.5 * (runs == others)))
 
 
 def _checked(name: str, values: Sequence[float]) -> np.ndarray:

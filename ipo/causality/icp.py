@@ -95,7 +95,9 @@ def _same_mean_and_variance(fits: np.ndarray, products: np.ndarray) -> np.ndarra
     sums = fits @ products[:, -1].T  # [sets, E]
     squares = np.einsum("si,eij,sj->se", fits, products, fits)
 
-    def mean_and_variance(n, total, square):
+    def mean_and_variance(
+        n: np.ndarray, total: np.ndarray, square: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         return n, total / n, (square - total**2 / n) / (n - 1)
 
     n, mean, variance = mean_and_variance(ones, sums, squares)

@@ -87,8 +87,11 @@ class Regression:
     @property
     def costs(self) -> list[Cost]:
         """The risk ``[R]`` of every domain as a function of its own."""
-        domains = [self.domain(e) for e in range(self.shape[1])]
-        return [lambda v, domain=domain: domain.risks(v).squeeze(1) for domain in domains]
+
+        def cost_in(domain: Regression) -> Cost:
+            return lambda v: domain.risks(v).squeeze(1)
+
+        return [cost_in(self.domain(e)) for e in range(self.shape[1])]
 
     @property
     def optima(self) -> Tensor:
@@ -280,10 +283,10 @@ def irm_game_variable_phi(task: Task, settings: PredictorSettings) -> Tensor:
             optimizer, lambda: _objective(task, settings, predictor(players.policy, Phi)).mean(1)
         )
 
-    costs = [
-        lambda w, cost=cost: cost(predictor(w, Phi.detach()))
-        for cost in _domain_costs(task, settings)
-    ]
+    def above_phi(cost: Cost) -> Cost:
+        return lambda w: cost(predictor(w, Phi.detach()))
+
+    costs = [above_phi(cost) for cost in _domain_costs(task, settings)]
     for _ in range(settings.num_iterations):
         players.round(costs, move_phi=move_phi)
     return predictor(players.policy, Phi).detach()
@@ -302,10 +305,11 @@ def _players(task: Task, settings: PredictorSettings, dim: int) -> LinearPlayers
 
 def _domain_costs(task: Task, settings: PredictorSettings) -> list[Cost]:
     """What each domain's player wants low: ``cost(v) [R]``."""
-    domains = [task.domain(e) for e in range(task.shape[1])]
-    return [
-        lambda v, domain=domain: _objective(domain, settings, v).squeeze(1) for domain in domains
-    ]
+
+    def cost_in(domain: Task) -> Cost:
+        return lambda v: _objective(domain, settings, v).squeeze(1)
+
+    return [cost_in(task.domain(e)) for e in range(task.shape[1])]
 
 
 def _objective(task: Task, settings: PredictorSettings, v: Tensor) -> Tensor:

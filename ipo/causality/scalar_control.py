@@ -63,7 +63,11 @@ def costs(betas: Tensor) -> list[Cost]:
         raise ValueError(f"betas: has shape {tuple(betas.shape)}, must be [problems, domains]")
     if not bool(torch.isfinite(betas).all()):
         raise ValueError("betas: holds NaN or infinite coefficients, must be finite")
-    return [lambda k, beta=beta: training_cost(k, beta) for beta in betas.unbind(1)]
+
+    def cost_at(beta: Tensor) -> Cost:
+        return lambda gains: training_cost(gains, beta)
+
+    return [cost_at(beta) for beta in betas.unbind(1)]
 
 
 def unseen_cost(gains: Tensor, betas: Tensor) -> Tensor:
