@@ -99,8 +99,9 @@ CHANGES = {
 PACKAGES = {
     "torch: another default of Adam": (
         "import torch\n"
-        "torch.optim.AdamW.__init__.__defaults__ = tuple(\n"
-        "    (0.9, 0.99) if d == (0.9, 0.999) else d for d in torch.optim.AdamW.__init__.__defaults__\n"
+        "start = torch.optim.AdamW.__init__\n"
+        "start.__defaults__ = tuple(\n"
+        "    (0.9, 0.99) if d == (0.9, 0.999) else d for d in start.__defaults__\n"
         ")\n",
         "algorithm/table",
     ),
@@ -163,7 +164,8 @@ CLEAN_UPS = {
         r"    return \[g \* (scale.reshape.*) for g in gradients\]\n",
         "    scaled = []\n"
         "    for g in gradients:\n"
-        r"        scaled.append(g * \1)" "\n"
+        r"        scaled.append(g * \1)"
+        "\n"
         "    return scaled\n",
         "keys/curves",
     ),
