@@ -556,7 +556,7 @@ def _random_assignment(parents: Sequence[str], rng: np.random.Generator) -> Line
     return Linear({parent: rng.normal() for parent in parents}, Normal(0, rng.uniform(0.5, 2)))
 
 
-def largest_change(models: Sequence[SCM], target: str, S: Sequence[str]) -> float:
-    """By how much b_S and v_S of the population's regressions on S differ between models."""
-    fits = [population_regression(moments(model)[1], target, S) for model in models]
+def largest_change(covariances: Sequence[pd.DataFrame], target: str, S: Sequence[str]) -> float:
+    """By how much b_S and v_S of the population's regression on S differ between models."""
+    fits = [population_regression(covariance, target, S) for covariance in covariances]
     return max(np.ptp([[*b, v] for b, v in fits], axis=0))
