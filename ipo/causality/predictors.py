@@ -88,10 +88,13 @@ class Regression:
     def costs(self) -> list[Cost]:
         """The risk ``[R]`` of every domain as a function of its own."""
 
-        def cost_in(domain: Regression) -> Cost:
-            return lambda v: domain.risks(v).squeeze(1)
+        def cost_in(gram: Tensor, moment: Tensor, power: Tensor) -> Cost:
+            return lambda v: (
+                power - 2 * (v * moment).sum(-1) + torch.einsum("rp,rpq,rq->r", v, gram, v)
+            )
 
-        return [cost_in(self.domain(e)) for e in range(self.shape[1])]
+        domains = zip(self.gram.unbind(1), self.moment.unbind(1), self.power.unbind(1), strict=True)
+        return [cost_in(*domain) for domain in domains]
 
     @property
     def optima(self) -> Tensor:
