@@ -241,7 +241,6 @@ def bench_numbers(bench: Mapping[str, Any], num_updates: int = 190) -> dict[str,
         "speed_fine": speeds["ratio to 0.001 s, 32 doors"],
         "speed_plain": speeds["ratio to 0.001 s, one by one"],
         "memory": bench["memory_gib"],
-        "two_workers": bench["workers"]["2"] / bench["workers"]["1"],
     } | {
         f"core_{method}_{part}": seconds * num_updates / 60
         for method, parts in bench["update_cpu_seconds"].items()
