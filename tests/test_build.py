@@ -11,7 +11,8 @@ import pytest
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
 
 import claims
-import sources as provenance
+import provenance
+import sources
 from build import main
 from execute import load_notebooks, tree_hash
 
@@ -81,8 +82,9 @@ def toy(built_toy, tmp_path, monkeypatch) -> Path:
 
 def in_toy(patch: pytest.MonkeyPatch, root: Path) -> None:
     """The toy's own package, and no claims."""
-    patch.setattr(provenance, "PACKAGE", root / "ipo")
+    patch.setattr(sources, "PACKAGES", {"ipo": root / "ipo"})
     patch.setattr(claims, "write_fragments", lambda folder: None)
+    patch.setattr(provenance, "write_fragment", lambda folder: None)
 
 
 def executed(root: Path, name: str) -> Path:

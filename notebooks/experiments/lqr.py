@@ -143,8 +143,10 @@ def _norm(gain: Tensor) -> Tensor:
     return torch.linalg.matrix_norm(gain)
 
 
-def short(cell: Cell) -> Cell:
-    """At full size, some dozens of iterations."""
+def short(cell: Cell) -> Cell | None:
+    """Some dozens of iterations. More domains or distractors cost more and are of no other kind."""
+    if cell.num_domains > 5 or cell.dim_distractor > 1000:
+        return None
     if cell.settings is None:
         return cell
     few = 3 if cell.settings.optimizer == "lbfgs" else 30

@@ -27,7 +27,7 @@ class Cell:
 
     environment: str
     num_updates: int = 2
-    num_steps: int = 250
+    num_steps: int = 64
 
     @property
     def columns(self) -> dict[str, Any]:
