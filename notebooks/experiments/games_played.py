@@ -31,7 +31,7 @@ from ipo.causality.small_games import (
     vote,
 )
 from ipo.checks import check_choice
-from ipo.game import average
+from ipo.game import Cost, average
 
 REGRESSIONS = {"noise": correlated_noise, "effect": effect_of_target}
 PROBLEMS = (*REGRESSIONS, "control")
