@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import statistics
 import sys
 import time
@@ -23,6 +22,7 @@ from pathlib import Path
 import torch
 from tqdm import tqdm
 
+from experiments.files import replace_text
 from ipo.game import LinearPlayers
 from ipo.lqr import sample_problem
 from ipo.lqr_learners import LQR_METHODS, published_lqr, train
@@ -60,10 +60,12 @@ def training(method: str, block: int) -> Iterator:
 def largest_difference() -> float:
     """Between the controllers that the two implementations learn."""
     settings = replace(published_lqr("ipo_fixed_phi"), num_iterations=NUM_COMPARED)
-    *_, (_, fast) = train(sample_problem([0], **SIZES, dtype=torch.float64), settings, [0])
+    problem = sample_problem([0], **SIZES, dtype=torch.float64)
+    *_, (_, gain) = train(problem, settings, [0])
+    fast = gain[0]
     A, Ws, _ = straightforward.problem(0, **SIZES, dtype=torch.float64)
     slow = straightforward.ipo_fixed_phi(A, Ws, NUM_COMPARED, settings.learning_rate)
-    return float((fast[0] - slow).abs().max() / slow.abs().max())
+    return float((fast - slow).abs().max() / slow.abs().max())
 
 
 def compare(block: int, num_blocks: int) -> dict[str, list[float]]:
@@ -98,7 +100,7 @@ def adam_alone(block: int, num_blocks: int) -> dict[str, list[float]]:
     """Milliseconds of all players' Adam steps without a cost or a gradient: the lower bound."""
     problem = sample_problem(SEEDS, **SIZES)
     starts = torch.zeros(len(SEEDS), problem.num_domains, *problem.gain_shape)
-    game = LinearPlayers(starts, lambda weights: make_optimizer("adam", weights, 5e-4))
+    game = LinearPlayers(starts, lambda player: make_optimizer("adam", player, 5e-4))
     for player in game.players:
         player.grad = torch.ones_like(player)
 
@@ -108,12 +110,6 @@ def adam_alone(block: int, num_blocks: int) -> dict[str, list[float]]:
                 optimizer.step()
 
     return {"Adam alone, ipo_fixed_phi [ms]": [cpu_ms(update, block) for _ in range(num_blocks)]}
-
-
-def write(path: Path, content: dict) -> None:
-    temporary = path.with_name(f"{path.name}.tmp")
-    temporary.write_text(json.dumps(content, indent=1) + "\n")
-    os.replace(temporary, path)
 
 
 def main() -> None:
@@ -140,7 +136,8 @@ def main() -> None:
     for name, row in rows.items():
         print(f"{name:46}" + "".join(f"{value:10.1f}" for value in row.values()))
     if options.json:
-        write(options.json, {"relative_difference": difference, "rows": rows})
+        numbers = {"relative_difference": difference, "rows": rows}
+        replace_text(options.json, json.dumps(numbers, indent=1) + "\n")
 
 
 if __name__ == "__main__":

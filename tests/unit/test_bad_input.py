@@ -1,6 +1,6 @@
 """Bad input: an error before any work that names the parameter, its value and the rule.
 
-Damaged results files and folders that cannot be written are in ``test_store.py``.
+Damaged results files and folders that cannot be written are in ``test_results.py``.
 """
 
 import math
@@ -288,5 +288,5 @@ def test_results_without_proper_seeds(tmp_path, seeds, message):
 
     cell = Cell("oracle", 2, 20, None)
     with pytest.raises(ValueError, match=message):
-        Store(tmp_path / "new", "rows").fill(Experiment(run), [cell], seeds)
+        Store(tmp_path / "new", "rows").fill(Experiment(run, Cell), [cell], seeds)
     assert list(tmp_path.iterdir()) == []
