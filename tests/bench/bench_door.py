@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import resource
 import statistics
 import time
@@ -21,9 +20,8 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from experiments.door_training import NETWORK, TRAIN_FRICTIONS, make_doors, published
-from ipo.ppo import Training, improve
-from ipo.rollouts import collect
+from experiments.door_training import NETWORK, new_training, published_door
+from experiments.files import replace_text
 from ipo.worlds.door import DoorEnv
 from ipo.worlds.many_doors import VectorDoor
 
@@ -94,39 +92,16 @@ def simulation(num_steps: int, num_blocks: int) -> dict[str, list[float]]:
 
 def update_costs(method: str) -> dict[str, float]:
     """CPU seconds of a published update: simulation, and what learning costs."""
-    settings = published(method)
-    training = Training(NETWORK, NETWORK.start, make_doors, len(TRAIN_FRICTIONS), settings, [0])
+    training = new_training(published_door(method), seed=0)
     costs = {"simulation": 0.0, "learning": 0.0}
-    for d in range(len(training.players)):
-        found = []
-        costs["simulation"] += cpu_seconds(
-            lambda d=d, found=found: found.append(
-                collect(
-                    NETWORK.frozen(training.players),
-                    NETWORK.distribution,
-                    training.environments[d],
-                    training.observations[d],
-                    settings.num_steps,
-                    training.draws,
-                    training.normalizers[d],
-                    settings.discount,
-                    settings.gae_lambda,
-                    settings.time_outs,
-                )
-            )
-        )
-        frames = found[0][0].frames()
-        costs["learning"] += cpu_seconds(
-            lambda d=d, frames=frames: improve(
-                NETWORK,
-                training.players,
-                d,
-                training.optimizers[d],
-                frames,
-                settings,
-                training.orders,
-            )
-        )
+    for d, collector in enumerate(training.collectors):
+        average = NETWORK.frozen(training.players)
+        start = time.process_time()
+        rollout = collector.collect(average, NETWORK.distribution, training.draws)
+        collected = time.process_time()
+        training.improve(d, rollout.frames())
+        costs["simulation"] += collected - start
+        costs["learning"] += time.process_time() - collected
     return costs
 
 
@@ -157,10 +132,7 @@ def main() -> None:
     print(f"Memory at its peak: {memory:.2f} GiB")
     if options.json:
         numbers = {"speeds": speeds, "update_cpu_seconds": costs, "memory_gib": memory}
-        text = json.dumps(numbers, indent=1) + "\n"
-        temporary = options.json.with_name(f"{options.json.name}.tmp")
-        temporary.write_text(text)
-        os.replace(temporary, options.json)
+        replace_text(options.json, json.dumps(numbers, indent=1) + "\n")
 
 
 if __name__ == "__main__":
