@@ -111,8 +111,8 @@ def test_second_build_does_nothing(toy, capsys):
     [
         ("environment.txt", "numpy==3\n", {"plain", "painted"}),
         ("data/paper/table.csv", "2\n", {"plain", "painted"}),
-        ("data/results/plain/rows.csv", "2\n", {"plain"}),
-        ("data/results/plain/more.csv", "2\n", {"plain"}),
+        ("data/results/plain/rows.csv", "2\n", {"plain", "painted"}),
+        ("data/results/plain/more.csv", "2\n", {"plain", "painted"}),
         ("notebooks/profiles/class.yml", "plain: {num_runs: 4}\n", {"plain"}),
         ("ipo/colors.py", 'from ipo import shades\n\nRED = "red"\n', {"painted"}),
         ("ipo/shades.py", 'DARK = "light"\n', {"painted"}),

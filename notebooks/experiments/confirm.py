@@ -9,7 +9,7 @@ For each cell the first recorded batch is computed again and held beside the shi
 - ``alike``: for networks, whose training is chaotic, runs that could be others of the same cell;
 - ``differs`` otherwise, and the command fails in the end.
 
-The outcome stands in ``data/witness/confirmed.json`` with the commit of the code. What has been
+The outcome stands in ``data/confirmed.json`` with the commit of the code. What has been
 confirmed at the present commit of the code, or since COMMIT, is not computed again, so that an
 interrupted run goes on.
 """
@@ -35,9 +35,9 @@ from experiments import origin
 from experiments.files import replace_text
 from experiments.registry import DATA, chosen
 from experiments.store import Store, select
-from experiments.witness import WITNESS, Slice, side_by_side, within
+from experiments.witness import Slice, side_by_side, within
 
-CONFIRMED = WITNESS / "confirmed.json"
+CONFIRMED = DATA / "confirmed.json"
 CHAOTIC = (
     *("keys/main", "keys/variants", "keys/larger", "keys/curves"),
     *("algorithm/players", "door/curves", "door/gaps"),

@@ -32,9 +32,8 @@ def toy(tmp_path, monkeypatch):
         monkeypatch.setattr(module, "DATA", tmp_path)
     for module in (registry, witness):
         monkeypatch.setattr(module, "CHAPTERS", {"lqr": experiments})
-    for module in (witness, confirm):
-        monkeypatch.setattr(module, "WITNESS", tmp_path / "witness", raising=False)
-    monkeypatch.setattr(confirm, "CONFIRMED", tmp_path / "witness" / "confirmed.json")
+    monkeypatch.setattr(witness, "WITNESS", tmp_path / "witness")
+    monkeypatch.setattr(confirm, "CONFIRMED", tmp_path / "confirmed.json")
     monkeypatch.setitem(SHIFT, "cost", 0.0)
     Store(tmp_path / "results" / "lqr", "toy").fill(experiments["toy"], CELLS, [0, 1, 2], 1)
     witness.record(num_workers=1)
