@@ -153,7 +153,8 @@ class VectorDoor(gym.vector.VectorEnv):
         for data, own in zip(self.data, np.asarray(state["physics"]), strict=True):
             data.qpos[:], data.qvel[:], data.qacc_warmstart[:] = np.split(own, 3)
         self.step_count = state["step_count"]
-        self.returns, self.opened = np.array(state["returns"]), np.array(state["opened"])
+        self.returns = np.asarray(state["returns"]).copy()
+        self.opened = np.asarray(state["opened"]).copy()
         self._shift_handles(np.asarray(state["handle_shifts"]))
         self._observe()
 
