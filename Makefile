@@ -7,7 +7,7 @@ IN_VENV := .venv/bin/python
 SETUP_SECONDS = --setup-seconds $$(( $$(date +%s) - $(STARTED) ))
 
 .DEFAULT_GOAL := help
-.PHONY: help setup book test reproduce claims serve lab lint format clean
+.PHONY: help setup book test verify confirm reproduce claims serve lab lint format clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## /{printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -18,9 +18,16 @@ setup: ## the environment in .venv (every other target does it first)
 book: setup ## execute what changed and build the site [PROFILE=class] [JOBS=cores]
 	@$(IN_VENV) book/build.py --profile $(PROFILE) $(if $(JOBS),--jobs $(JOBS)) $(SETUP_SECONDS)
 
-test: ## set-up, browser included, and the default test suite
+test: ## set-up, browser included, the witnesses, and the default test suite
 	@$(PYTHON) book/setup.py --system
+	@$(IN_VENV) -m experiments.witness verify
 	@$(IN_VENV) -m pytest
+
+verify: setup ## whether today's code still gives the results: a slice of every kind of cell [CHAPTER=lqr]
+	@$(IN_VENV) -m experiments.witness verify $(CHAPTER)
+
+confirm: setup ## one full batch of every cell again, hours; goes on where it was [CHAPTER=lqr] [SINCE=commit]
+	@$(IN_VENV) -m experiments.confirm $(CHAPTER) $(if $(SINCE),--since $(SINCE))
 
 reproduce: setup ## every result from nothing, into data/reproduced [CHAPTER=lqr]
 	@rm -rf book/_executed/paper
@@ -36,11 +43,11 @@ serve: setup ## the built site on http://localhost:8000
 lab: setup ## the notebooks in JupyterLab
 	@$(IN_VENV) -m jupyterlab
 
-lint: setup ## ruff's checks and format, without changing anything
-	@$(IN_VENV) -m ruff check && $(IN_VENV) -m ruff format --check
+lint: setup ## ruff's checks and format, and the types of ipo/, without changing anything
+	@$(IN_VENV) -m ruff check && $(IN_VENV) -m ruff format --check && $(IN_VENV) -m mypy
 
 format: setup ## ruff's format and safe repairs
 	@$(IN_VENV) -m ruff check --fix && $(IN_VENV) -m ruff format
 
 clean: ## remove what was built; the environment and data/ stay
-	@rm -rf book/_build book/_executed .pytest_cache .ruff_cache .hypothesis
+	@rm -rf book/_build book/_executed .pytest_cache .ruff_cache .mypy_cache .hypothesis

@@ -28,8 +28,8 @@ def load_cells(results: list[str], chapter: dict, data: Path = DATA) -> Cells:
     columns = [*ROW_COLUMNS, *chapter["columns"]]
     frames = []
     for name in results:
-        chosen, _, file = name.partition("/")
-        rows = Store(data / "results" / chosen, file).rows()
+        folder, _, file = name.partition("/")
+        rows = Store(data / "results" / folder, file).rows()
         if len(rows):
             frames.append(rows)
             if missing := set(columns) - set(rows.columns):

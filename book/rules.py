@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 import scipy.stats
 
+from experiments.store import select
 from ipo.worlds.pulling import strategy_of_policy
 
 CONFIGURATION = ["num_domains", "dim_distractor"]
@@ -52,11 +53,9 @@ class Cells:
     num_runs: int
 
     def select(self, **where) -> pd.DataFrame:
-        """The rows with these values in these columns."""
-        chosen = self.rows
-        for column, value in where.items():
-            chosen = chosen[chosen[column] == value]
-        return chosen
+        """The rows with these values in these columns; domains are words, also those of doors."""
+        words = {"domain": str(where["domain"])} if "domain" in where else {}
+        return select(self.rows, where | words)
 
     def runs(self, **where) -> pd.Series:
         """Value of every run of a cell, or the mean of its values, indexed by run."""

@@ -17,10 +17,18 @@ import sklearn.datasets
 import torch
 from torch import Tensor
 
+from experiments import figures
 from experiments.experiment import Experiment
 from experiments.rows import tidy
-from ipo.causality.predictors import METHODS, Classification, Regression, Settings, icp
-from ipo.causality.scm import SCM, Linear, Normal, moments
+from experiments.store import select
+from ipo.causality.icp import icp
+from ipo.causality.predictors import (
+    PREDICTOR_METHODS,
+    Classification,
+    PredictorSettings,
+    Regression,
+)
+from ipo.causality.scm import SCM, Linear, Normal, moments, population_regression
 from ipo.checks import check_choice, check_number
 
 DIM = 5  # causes, and as many effects, in the linear example
@@ -39,7 +47,7 @@ class Cell:
     """A method on a problem.
 
     Attributes:
-        method: one of :data:`ipo.causality.predictors.METHODS`, ``icp`` or ``oracle``.
+        method: one of :data:`ipo.causality.predictors.PREDICTOR_METHODS`, ``icp`` or ``oracle``.
         problem: one of :data:`VARIANTS` or :data:`PROBLEMS`, or ``digits``.
         level: what a problem of :data:`PROBLEMS` varies; zero otherwise.
         settings: how the method is trained; ``None`` for what is not trained by steps.
@@ -47,11 +55,11 @@ class Cell:
 
     method: str
     problem: str
-    settings: Settings | None
+    settings: PredictorSettings | None
     level: float = 0.0
 
     def __post_init__(self) -> None:
-        check_choice("method", self.method, (*METHODS, "icp", "oracle"))
+        check_choice("method", self.method, (*PREDICTOR_METHODS, "icp", "oracle"))
         check_choice("problem", self.problem, (*VARIANTS, *PROBLEMS, "digits"))
         check_number("level", self.level, least=0)
         if (self.settings is None) != (self.method in ("icp", "oracle")):
@@ -157,11 +165,22 @@ def _run_chain(cell: Cell, seeds: list[int]) -> dict[tuple[str, str], Tensor]:
     """IRMv1 and V-REx train in two domains and keep the third for choosing their penalty."""
     runs = [chain_run(cell.problem, seed) for seed in seeds]
     features, targets = stack([domains for domains, _, _ in runs])
-    rotations = torch.tensor(np.stack([rotation for _, _, rotation in runs]))
-    test = Regression(*(torch.stack([t[i] for _, t, _ in runs]).unsqueeze(1) for i in range(3)))
+    rotations = np.stack([rotation for _, _, rotation in runs])
     num_train = 2 if cell.method in ("irmv1", "vrex") else 3
-    v = fit(cell, features[:num_train], targets[:num_train], causal=CAUSAL @ rotations.numpy())
-    risks = Regression.from_samples(features, targets).risks(v)
+    v = fit(cell, features[:num_train], targets[:num_train], causal=CAUSAL @ rotations)
+    return chain_metrics(runs, v, num_train)
+
+
+def chain_metrics(
+    runs: Sequence[tuple[list[Domain], tuple[Tensor, ...], np.ndarray]],
+    v: Tensor,
+    num_train: int = 3,
+) -> dict[tuple[str, str], Tensor]:
+    """What coefficients ``v [R, d]`` of the runs of :func:`chain_run` come to."""
+    task = Regression.from_samples(*stack([domains for domains, _, _ in runs]))
+    test = Regression(*(torch.stack([t[i] for _, t, _ in runs]).unsqueeze(1) for i in range(3)))
+    risks = task.risks(v)
+    rotations = torch.tensor(np.stack([rotation for _, _, rotation in runs]))
     v = (rotations @ v.unsqueeze(-1)).squeeze(-1)  # coefficients of X1 and X2 themselves
     errors = (v - torch.tensor(CAUSAL)).square()
     return {
@@ -182,7 +201,7 @@ def fit(cell: Cell, features: list[Tensor], targets: list[Tensor], causal: np.nd
             icp([x[r] for x in features], [y[r] for y in targets]) for r in range(len(features[0]))
         ]
         return torch.tensor(np.stack([run.coefficients for run in runs]))
-    return METHODS[cell.method](Regression.from_samples(features, targets), cell.settings)
+    return PREDICTOR_METHODS[cell.method](Regression.from_samples(features, targets), cell.settings)
 
 
 def stack(runs: Sequence[Sequence[Domain]]) -> tuple[list[Tensor], list[Tensor]]:
@@ -301,7 +320,7 @@ def _run_digits(cell: Cell, seeds: list[int]) -> dict[tuple[str, str], Tensor]:
         )
         for name in runs[0]
     }
-    v = METHODS[method](task["train"], settings)
+    v = PREDICTOR_METHODS[method](task["train"], settings)
     risks = task["validation"].risks(v)
     return {
         ("train", "train_error"): task["train"].errors(v).mean(1),
@@ -313,9 +332,9 @@ def _run_digits(cell: Cell, seeds: list[int]) -> dict[tuple[str, str], Tensor]:
 
 
 # Nothing here was tuned on a test domain: the ridge was set once, for ERM on gray images.
-DIGITS = Settings(ridge=0.01, learning_rate=0.03, num_iterations=1000)
-CHAIN = Settings(learning_rate=0.003, num_iterations=5000, num_features=2 * DIM)
-SMALL = Settings(learning_rate=0.02, num_iterations=3000)
+DIGITS = PredictorSettings(ridge=0.01, learning_rate=0.03, num_iterations=1000)
+CHAIN = PredictorSettings(learning_rate=0.003, num_iterations=5000, num_features=2 * DIM)
+SMALL = PredictorSettings(learning_rate=0.02, num_iterations=3000)
 
 
 def short(cell: Cell) -> Cell | None:
@@ -330,3 +349,214 @@ def short(cell: Cell) -> Cell | None:
 
 
 EXPERIMENTS = {name: Experiment(run_cell, Cell, short) for name in ("linear", "digits", "failures")}
+
+# ------------------------------------------------------------------ cells of the experiments
+
+FAILURE_METHODS = ("erm", "icp", "irmv1", "vrex", "irm_game_fixed_phi")
+
+
+def penalized(
+    problem: str, settings: PredictorSettings, penalties: Sequence[float], level: float = 0.0
+) -> list[Cell]:
+    """IRMv1 and V-REx with every weight of their penalty."""
+    return [
+        Cell(method, problem, replace(settings, penalty=penalty), level)
+        for method in ("irmv1", "vrex")
+        for penalty in penalties
+    ]
+
+
+def linear_cells(
+    variants: Sequence[str], num_iterations: int, penalties: Sequence[float]
+) -> list[Cell]:
+    """All methods on variants of the linear example."""
+    settings = replace(CHAIN, num_iterations=num_iterations)
+    return [
+        cell
+        for variant in variants
+        for cell in (
+            Cell("oracle", variant, None),
+            Cell("icp", variant, None),
+            Cell("erm", variant, settings),
+            Cell("irm_game_fixed_phi", variant, settings),
+            Cell("irm_game_variable_phi", variant, settings),
+            *penalized(variant, settings, penalties),
+        )
+    ]
+
+
+def digit_cells(num_iterations: int, penalties: Sequence[float]) -> list[Cell]:
+    """All methods but ICP, which would have to test 2^128 sets, on the coloured digits."""
+    settings = replace(DIGITS, num_iterations=num_iterations)
+    return [
+        Cell("oracle", "digits", None),
+        Cell("erm", "digits", settings),
+        Cell("irm_game_fixed_phi", "digits", settings),
+        Cell("irm_game_variable_phi", "digits", replace(settings, num_features=10)),
+        *penalized("digits", settings, penalties),
+    ]
+
+
+def failure_cells(levels: Mapping[str, Sequence[float]], num_iterations: int) -> list[Cell]:
+    """:data:`FAILURE_METHODS` on the problems made to fail, at ``levels[problem]``."""
+    settings = replace(SMALL, num_iterations=num_iterations)
+    return [
+        cell
+        for problem, values in levels.items()
+        for level in map(float, values)
+        for cell in (
+            Cell("icp", problem, None, level),
+            Cell("erm", problem, settings, level),
+            Cell("irm_game_fixed_phi", problem, settings, level),
+            *penalized(problem, settings, [100.0], level),
+        )
+    ]
+
+
+# ----------------------------------------------- which rows a table shows, and under which name
+
+
+def chosen_by(rows: pd.DataFrame, criterion: str) -> pd.DataFrame:
+    """The rows of the penalty with the lowest ``criterion``: each run chooses by itself."""
+    keys = ["problem", "method", "run"]
+    scores = rows[rows["metric"] == criterion].sort_values("value", kind="stable")
+    best = scores.drop_duplicates(keys)[[*keys, "penalty"]]
+    return rows.merge(best, on=[*keys, "penalty"])
+
+
+def not_chosen(rows: pd.DataFrame, penalty: float) -> pd.DataFrame:
+    """IRMv1 and V-REx with one given penalty, as methods ``irmv1_strong`` and ``vrex_strong``."""
+    fixed = rows[rows["method"].isin(["irmv1", "vrex"]) & (rows["penalty"] == penalty)]
+    return fixed.assign(method=fixed["method"] + "_strong")
+
+
+def relative_to_causes(rows: pd.DataFrame) -> pd.DataFrame:
+    """Test risks divided by that of the predictor from the causes, the oracle, in the same run."""
+    test = rows[rows["metric"] == "test_risk"]
+    base = test[test["method"] == "oracle"].set_index(["problem", "run"])["value"]
+    index = pd.MultiIndex.from_frame(test[["problem", "run"]])
+    return test.assign(value=test["value"].to_numpy() / base.loc[index].to_numpy())
+
+
+def table_names(strong: float) -> dict[str, str]:
+    """Names in tables, in their order; ``strong`` is the penalty that nobody chose."""
+    label, not_chosen = figures.label, f"λ = {strong:.0f}, not chosen"
+    return {
+        "erm": label("erm"),
+        "icp": label("icp"),
+        "irmv1": f"{label('irmv1')}, λ chosen",
+        "irmv1_strong": f"{label('irmv1')}, {not_chosen}",
+        "vrex": f"{label('vrex')}, λ chosen",
+        "vrex_strong": f"{label('vrex')}, {not_chosen}",
+        "irm_game_fixed_phi": label("irm_game_fixed_phi"),
+        "irm_game_variable_phi": label("irm_game_variable_phi"),
+    }
+
+
+def beside_the_authors(
+    selected: pd.DataFrame, paper: pd.DataFrame, names: Mapping[str, str]
+) -> pd.DataFrame:
+    """Mean squared errors of the coefficients, ours and theirs, in the variants that both have."""
+    lines = []
+    for (variant, method), theirs in paper.groupby(["variant", "method"], sort=False):
+        mine = select(selected, {"problem": variant, "method": method})
+        if len(mine):
+            line = {"variant": variant, "method": names[method]}
+            for part, column in (("causes", "error_causal"), ("effects", "error_effects")):
+                line[f"{part}, ours"] = mine[mine["metric"] == column]["value"].mean()
+                line[f"{part}, theirs"] = theirs[column].mean()
+            lines.append(line)
+    return pd.DataFrame(lines)
+
+
+# ------------------------------------------------------------------------ numbers of the prose
+
+
+def linear_numbers(compared: pd.DataFrame, **variants: str) -> dict[str, Any]:
+    """Mean relative test errors of all methods, ``<name>_<method>`` for each ``name=variant``.
+
+    Of ICP in the variant ``first`` also the median, and how many runs missed the causes: they have
+    more than twice the causes' error, as a prediction of zero has.
+    """
+    numbers: dict[str, Any] = dict(variants)
+    for name, variant in variants.items():
+        for method in table_names(0):
+            numbers[f"{name}_{method}"] = mean_value(compared, method=method, problem=variant)
+    icp_runs = select(compared, {"method": "icp", "problem": variants["first"]})["value"]
+    return numbers | {"icp_missed": (icp_runs > 2).sum(), "icp_median": icp_runs.median()}
+
+
+def digit_numbers(
+    compared: pd.DataFrame, digits: pd.DataFrame, **weights: float
+) -> dict[str, float]:
+    """Mean test errors, and those of the penalised methods with each ``name=weight``."""
+    errors = compared[compared["metric"] == "test_error"].groupby("method")["value"].mean()
+    tests = digits[digits["metric"] == "test_error"]
+    by_weight = tests.groupby(["method", "penalty"])["value"].mean()
+    return {f"digits_{method}": value for method, value in errors.items()} | {
+        f"{name}{end}": value
+        for name, weight in weights.items()
+        for end, value in (
+            ("", weight),
+            ("_irmv1", by_weight["irmv1", weight]),
+            ("_vrex", by_weight["vrex", weight]),
+        )
+    }
+
+
+def failure_numbers(failures: pd.DataFrame) -> dict[str, float]:
+    """Mean test errors at the first and the last level of each problem.
+
+    Also the level where IRMv1 is worst on small shifts, and ICP on marked domains, and what all
+    methods come to there.
+    """
+    numbers = {}
+    for name, problem, watched in (
+        ("few", "few_domains", None),
+        ("shift", "small_shift", "irmv1"),
+        ("marked", "marked_domains", "icp"),
+    ):
+        rows = select(failures, {"problem": problem, "metric": "test_risk"})
+        levels = list(rows["level"].unique())
+        places = {"first": levels[0], "last": levels[-1]}
+        if watched:
+            errors = [mean_value(rows, method=watched, level=level) for level in levels]
+            numbers[f"{name}_worst"] = places["worst"] = levels[int(np.argmax(errors))]
+        for place, level in places.items():
+            for method in FAILURE_METHODS:
+                numbers[f"{name}_{place}_{method}"] = mean_value(rows, method=method, level=level)
+    return numbers
+
+
+def mean_value(rows: pd.DataFrame, **columns: Any) -> float:
+    """Mean value of the rows with these values in these columns."""
+    return float(select(rows, columns)["value"].mean())
+
+
+# -------------------------------------------- interventions at random, to check the theorem
+
+
+def same_graph(model: SCM, target: str, rng: np.random.Generator) -> SCM:
+    """New coefficients and noises at random for everything but the target; no arrow changes."""
+    others = [name for name in model.assignments if name != target]
+    return model.intervene(**{n: _random_assignment(model.parents(n), rng) for n in others})
+
+
+def any_graph(model: SCM, target: str, rng: np.random.Generator) -> SCM:
+    """A random order in which the target is after its causes; all depend on what is before them."""
+    others = [name for name in model.assignments if name != target]
+    while True:
+        order = list(rng.permutation([*others, target]))
+        if order.index(target) > max(map(order.index, model.parents(target))):
+            break
+    return model.intervene(**{n: _random_assignment(order[: order.index(n)], rng) for n in others})
+
+
+def _random_assignment(parents: Sequence[str], rng: np.random.Generator) -> Linear:
+    return Linear({parent: rng.normal() for parent in parents}, Normal(0, rng.uniform(0.5, 2)))
+
+
+def largest_change(covariances: Sequence[pd.DataFrame], target: str, S: Sequence[str]) -> float:
+    """By how much b_S and v_S of the population's regression on S differ between models."""
+    fits = [population_regression(covariance, target, S) for covariance in covariances]
+    return max(np.ptp([[*b, v] for b, v in fits], axis=0))

@@ -15,9 +15,9 @@ from myst_nb import glue
 from pandas.io.formats.style import Styler
 
 from experiments import figures, tables
-from experiments.experiment import Cell, Experiment, Places
+from experiments.experiment import Cell, Experiment, Places, rebuilt
 from experiments.origin import ROOT
-from experiments.store import Store
+from experiments.store import Store, timed
 
 
 class Chapter:
@@ -55,6 +55,18 @@ class Chapter:
         """Rows of an experiment: shipped ones are loaded, missing ones are computed and kept."""
         experiment = self.experiments[name].at(self.places)
         return Store(self.folder, name).fill(experiment, cells, list(seeds), self.workers)
+
+    def slices(self, name: str, **columns: Any) -> tuple[pd.DataFrame, pd.DataFrame]:
+        """Recorded short slices of the cells with these columns, and what they give now.
+
+        Such slices of all cells are what ``make verify`` computes again.
+        """
+        experiment = self.experiments[name].at(self.places)
+        store = Store(ROOT / "data" / "witness" / self.name, name)
+        batches = [b for b in store.batches() if columns.items() <= b["columns"].items()]
+        cells = [rebuilt(experiment.cell, batch["cell"]) for batch in batches]
+        now = [timed(experiment.run, c, b["seeds"])[1] for c, b in zip(cells, batches, strict=True)]
+        return store.rows(), pd.concat(now, ignore_index=True)
 
     def paper(self) -> pd.DataFrame:
         """The paper's numbers."""

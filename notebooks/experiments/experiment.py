@@ -59,7 +59,7 @@ class Experiment:
     """
 
     run: Callable[..., pd.DataFrame]
-    cell: type | None = None
+    cell: type
     short: Callable[[Any], Any | None] = lambda cell: cell
     seeds: tuple[int, ...] = (0, 1)
     reads: Callable[..., list[Path]] | None = None

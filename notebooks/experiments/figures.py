@@ -221,18 +221,36 @@ def network_graph(
     return nodes, edges
 
 
-def trajectories(energies: dict[str, np.ndarray], oracle: str) -> Figure:
-    """``|s_t|^2`` over time for several starts: ``{method: [starts, time]}``, median and range."""
+def trajectories(rows: pd.DataFrame, oracle: str) -> Figure:
+    """``|s_t|^2`` over time by method: quantiles ``energy_q05, _q50, _q95`` over starts."""
     fig, ax = plt.subplots(figsize=(7, 3.8))
-    for method, energy in energies.items():
+    for method, energy in rows.groupby("method", sort=False):
         name, color, _ = STYLES[method]
-        steps = np.arange(energy.shape[1])
-        low, middle, high = np.quantile(energy, [0.05, 0.5, 0.95], axis=0)
+        low, middle, high = energy.pivot(index="metric", columns="step", values="value").to_numpy()
+        steps = np.arange(len(middle))
         ax.plot(steps, middle, color=color, label=name, ls="--" if method == oracle else "-")
         ax.fill_between(steps, low, high, color=color, alpha=0.15, lw=0)
     ax.set(yscale="log", xlabel="time step", ylabel="$|s_t|^2$", ylim=(1e-6, None))
     ax.legend()
     return fig
+
+
+def draw_optimizers(ax: Axes, points: pd.DataFrame, x: str, y: str) -> None:
+    """Every run as a point: a colour per method, a mark per optimiser.
+
+    Runs with plain steps and L-BFGS have large hollow marks and crosses, for they may coincide.
+    """
+    for (method, optimizer), runs in points.groupby(["method", "optimizer"]):
+        name, color, marker = STYLES[method]
+        hollow = {"marker": marker, "facecolors": "none", "edgecolors": color}
+        look = {
+            "adam": {"s": 22, "marker": marker, "facecolors": color, "alpha": 0.8},
+            "none": {"s": 18, "marker": marker, "facecolors": color},
+            "plain": {"s": 110, **hollow},
+            "lbfgs": {"s": 110, "marker": "x", "color": color, "lw": 1},
+        }[optimizer]
+        suffix = {"adam": ", Adam", "none": "", "plain": ", plain", "lbfgs": ", L-BFGS"}[optimizer]
+        ax.scatter(runs[x], runs[y], label=name + suffix, **look)
 
 
 def causal_graph(
@@ -338,4 +356,87 @@ def time_in_cells(panels: Mapping[str, np.ndarray], phases: Sequence[str]) -> Fi
     for ax, phase in zip(axes[:, 0], phases, strict=True):
         ax.set_ylabel(phase)
     fig.colorbar(picture, ax=axes, label="expected steps", shrink=0.7)
+
+
+def decision_process(process: SCM, policy: SCM) -> Figure:
+    """Fig. 3 of the paper: two time steps of a decision process, and a policy in its two parts."""
+    places = {"s_t": (0, 1), "z_t": (1, 2), "o_t": (1, 0), "a_t": (2, 0)}
+    places |= {"r_t": (2, 2), "s_{t+1}": (3, 1)}
+    fig, (left, right) = plt.subplots(1, 2, figsize=(7.5, 3.4), width_ratios=[3, 1])
+    labels = {"z_t": r"$\tilde{s}_t$", "s_{t+1}": "$s_{t+1}$"}
+    causal_graph(left, process, places, labels, changed={"o_t"})
+    causal_graph(right, policy, {"o_t": (0, 0), "h_t": (0, 1), "a_t": (0, 2)})
+    left.set_title("(a) the decision process")
+    right.set_title("(b) the policy")
+    right.set_xlim(-1, 1)
+    right.text(0.15, 0.45, r"$\Phi$")
+    right.text(0.15, 1.45, r"$\pi$")
+    return fig
+
+
+def draw_selected(ax: Axes, data: pd.DataFrame, x: str, y: str, kept: str) -> None:
+    """Samples that ``kept`` keeps and others, in two colours, and a line fitted to the kept."""
+    few = data.iloc[:1500]
+    for value, color, name in ((0, "0.75", "failed"), (1, "#0072B2", "succeeded")):
+        part = few[few[kept] == value]
+        ax.scatter(part[x], part[y], s=8, color=color, label=name)
+    slope, start = np.polyfit(*data[data[kept] == 1][[x, y]].to_numpy().T, 1)
+    line = np.array([-1.5, 3])
+    ax.plot(line, start + slope * line, color="black", label="fit to the successful")
+    ax.legend(loc="lower left", fontsize=8)
+
+
+def errors_by_strength(errors: Mapping[str, pd.DataFrame]) -> Figure:
+    """A panel for each kind of intervention: a line per predictor, over the index ``strength``."""
+    fig, axes = plt.subplots(1, len(errors), figsize=(10, 3.4), sharey=True)
+    for ax, (title, table) in zip(axes, errors.items(), strict=True):
+        for name, color in zip(table.columns, ("#0072B2", "#D55E00", "#009E73"), strict=True):
+            ax.plot(table.index, table[name], color=color, label=name)
+        ax.set(title=title, xlabel="strength of the intervention", ylim=(0, 6))
+    axes[0].set_ylabel("mean squared error")
+    axes[0].legend()
+    return fig
+
+
+def colored_digits(domains: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> Figure:
+    """Ten digits of each domain and their labels: of 8x8 orange, then 8x8 blue pixels."""
+    orange, blue = (0.84, 0.37, 0.0), (0.0, 0.45, 0.70)
+    fig, axes = plt.subplots(len(domains), 10, figsize=(8, 3))
+    for row, (name, (x, y)) in zip(axes, domains.items(), strict=True):
+        for ax, features, label in zip(row, x, y, strict=False):
+            inks = features[:128].reshape(2, 8, 8, 1) * (1 - np.array([[[orange]], [[blue]]]))
+            ax.imshow(1 - inks.sum(0))
+            ax.set_title(f"y = {label:.0f}", fontsize=8)
+            ax.set(xticks=[], yticks=[])
+            ax.grid(False)
+        row[0].set_ylabel(name, fontsize=8)
+    return fig
+
+
+def errors_by_level(
+    rows: pd.DataFrame, methods: Sequence[str], xlabel: str, ticks: Sequence[float] = ()
+) -> Figure:
+    """Test errors by what a problem varies; with ``ticks`` the axis is logarithmic."""
+    fig, ax = plt.subplots(figsize=(6.5, 3.8))
+    interval_lines(ax, rows, "test_risk", "level", methods, baseline=1.0)
+    ax.set(xlabel=xlabel, ylabel="mean squared error, test domain", ylim=(0, None))
+    ax.legend(fontsize=8, ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1))
+    if ticks:
+        ax.set_xscale("log")
+        ax.set_xticks(ticks, ticks)
+        ax.minorticks_off()
+    return fig
+
+
+def errors_by_penalty(rows: pd.DataFrame, oracle: float) -> Figure:
+    """Errors of IRMv1 and V-REx, in the test domain and held out, by the weight of the penalty."""
+    fig, axes = plt.subplots(1, 2, figsize=(8.5, 3.8), sharey=True)
+    for ax, method in zip(axes, ("irmv1", "vrex"), strict=True):
+        for metric, style in (("test_error", "-"), ("validation_error", ":")):
+            draw_metric(ax, rows, metric, "penalty", [method], ls=style)
+        ax.axhline(oracle, color="black", lw=1, ls="--")
+        ax.set(xscale="log", title=label(method), xlabel="weight of the penalty λ", ylim=(0, 1))
+    axes[0].set_ylabel("share of wrong labels")
+    lines = ["test domain", "held out, training domains", "grey images, test domain"]
+    axes[0].legend(axes[0].get_lines(), lines, fontsize=8)
     return fig

@@ -17,13 +17,14 @@ import torch
 from minigrid.core.constants import OBJECT_TO_IDX
 
 from experiments.experiment import Experiment
+from experiments.policies import load_policy, save_policy
 from experiments.rows import tidy
 from experiments.tables import mean_and_std
 from experiments.tabulated import load_or_tabulate
 from ipo.checks import check_choice
 from ipo.distributions import Categorical
-from ipo.networks import GridNetwork, OnTable, Weights, load_policy, save_policy
-from ipo.ppo import Settings, published, train
+from ipo.networks import GridNetwork, OnTable, Weights
+from ipo.ppo import PPOSettings, Training
 from ipo.stats import paired_difference, probability_of_improvement
 from ipo.worlds.colored_keys import COLORS, ColoredKeysEnv
 from ipo.worlds.tabular import (
@@ -43,6 +44,16 @@ NUM_COPIES, NUM_EPISODES = 50, 100  # of the published evaluation
 NUM_SAVED = 10  # runs of a cell whose weights are kept
 
 
+def published(method: str, **changes: Any) -> PPOSettings:
+    """The settings of the paper's runs on the coloured keys, with ``changes``."""
+    paper = {
+        "learning_rate": 5e-4 if method == "ipo" else 1e-3,
+        "time_outs": "terminal",
+        "skip_last_frames": True,
+    }
+    return PPOSettings(method, **(paper | changes))
+
+
 @dataclass(frozen=True)
 class Cell:
     """One configuration of the experiment.
@@ -57,7 +68,7 @@ class Cell:
     """
 
     label: str
-    settings: Settings
+    settings: PPOSettings
     train_colors: tuple[str, ...] = TRAINED
     color_encoding: str = "integer"
     size: int = 5
@@ -207,11 +218,10 @@ class Keys:
         self.network = GridNetwork(encode(self.tasks["red"].images, color_encoding).shape[-1])
 
     def train(self, cell: Cell, seeds: list[int]) -> Iterator[tuple[int, list[Weights]]]:
-        """:func:`ipo.ppo.train` in the cell's training colours."""
+        """:meth:`ipo.ppo.Training.reports` in the cell's training colours."""
         domains = TabularDomains([self.tasks[color] for color in cell.train_colors])
         network = OnTable(self.network, encode(domains.images, self.color_encoding))
-        num_domains = len(cell.train_colors)
-        return train(network, self.network.start, domains, num_domains, cell.settings, seeds)
+        return Training(network, domains, len(cell.train_colors), cell.settings, seeds).reports()
 
     def logits(self, players: Sequence[Weights], images: np.ndarray) -> torch.Tensor:
         """Of the average policy ``[R, K, A]`` for MiniGrid's ``images [K, 7, 7, 3]``.

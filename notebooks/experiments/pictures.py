@@ -67,6 +67,19 @@ def film_strip(
     return fig
 
 
+def titled(
+    pictures: Sequence[tuple[str, np.ndarray]], num_rows: int, size: tuple[float, float]
+) -> Figure:
+    """Pictures with their titles, in rows of the same length."""
+    fig, axes = plt.subplots(num_rows, -(-len(pictures) // num_rows), figsize=size, squeeze=False)
+    for ax in axes.flat:
+        ax.axis("off")
+    for ax, (title, picture) in zip(axes.flat, pictures, strict=False):
+        ax.imshow(picture)
+        ax.set_title(title, fontsize=9)
+    return fig
+
+
 def side_by_side(episodes: Sequence[Sequence[np.ndarray]], gap: int = 8) -> list[np.ndarray]:
     """One film of several: those that are over stand still on their last frame."""
     length = max(map(len, episodes))
@@ -143,7 +156,7 @@ class DoorPicture:
         ]
         self.follows = camera == "handle"
 
-    def frame(self, qpos: np.ndarray, handle_shift: np.ndarray = (0.0, 0.0)) -> np.ndarray:
+    def frame(self, qpos: np.ndarray, handle_shift: np.ndarray) -> np.ndarray:
         """A picture ``[height, width, 3]`` of the joints ``[7]``."""
         shift_handle(self.model, self.params, handle_shift)
         self.data.qpos[:] = qpos
@@ -165,6 +178,27 @@ class RenderError(RuntimeError):
     """No pictures can be drawn on this machine."""
 
 
+class Blank:
+    """What stands where a door cannot be drawn."""
+
+    def __init__(self, width: int, height: int) -> None:
+        self.picture = np.full((height, width, 3), 220, np.uint8)
+
+    def frame(self, *_: Any) -> np.ndarray:
+        return self.picture
+
+
+def camera(
+    params: DoorParams, view: str = "handle", width: int = 240, height: int = 180
+) -> DoorPicture | Blank:
+    """Draws a door; without OpenGL, says what to install and goes on without pictures."""
+    try:
+        return DoorPicture(params, width, height, view)
+    except RenderError as error:
+        print(error)
+        return Blank(width, height)
+
+
 def _free(context: Any, opengl: mujoco.MjrContext) -> None:
     """Give the memory of OpenGL back: its numbers only mean something in their own context."""
     context.make_current()
@@ -176,7 +210,7 @@ def door_scene(params: DoorParams, width: int = 640, height: int = 480) -> mujoc
     """:func:`ipo.worlds.door.build_door` with paint, light, frame, wall and floor, for pictures."""
     spec = build_door(params)
     spec.visual.global_.offwidth, spec.visual.global_.offheight = width, height
-    spec.visual.quality.shadowsize, spec.visual.quality.offsamples = 4096, 8
+    spec.visual.quality.shadowsize, spec.visual.quality.offsamples = 2048, 8
     spec.visual.headlight.ambient, spec.visual.headlight.diffuse = [0.38] * 3, [0.25] * 3
     spec.visual.headlight.specular = [0.05] * 3
     spec.visual.map.znear, spec.visual.map.zfar = 0.01, 30

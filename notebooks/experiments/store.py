@@ -28,7 +28,7 @@ from filelock import FileLock
 from tqdm import tqdm
 
 from experiments import origin
-from experiments.experiment import Cell, Experiment
+from experiments.experiment import Cell, Experiment, rebuilt
 from experiments.files import replace_text
 from ipo.checks import check_counts
 
@@ -70,8 +70,12 @@ class Store:
         return self._read()[0]
 
     def batches(self) -> list[Batch]:
-        """The origin of every batch, as recorded when it was computed."""
-        return self._read()[1]
+        """The origin of every batch, as recorded when it was computed; rows are not looked at.
+
+        Raises:
+            ResultsError: a record that cannot be read, or rows without one.
+        """
+        return self._record()[1]
 
     def rows_of(self, batch: Batch) -> pd.DataFrame:
         """The rows of one batch."""
@@ -125,20 +129,10 @@ class Store:
 
     def _read(self) -> tuple[pd.DataFrame, list[Batch]]:
         """Rows and batches, every batch checked against its rows."""
-        if not self.json.exists():
-            if self.csv.exists():
-                raise ResultsError(
-                    f"{self.csv}: has no {self.json.name} beside it that says where it comes from"
-                )
+        types, batches = self._record()
+        if not batches:  # or killed before the first batch was saved whole
             return NO_ROWS, []
         try:
-            record = json.loads(self.json.read_text(encoding="utf-8"))
-            types, batches = dict(record["types"]), list(record["batches"])
-            for batch in batches:
-                if absent := KEYS - batch.keys():
-                    raise KeyError(f"a batch without {min(absent)}")
-            if not batches:  # killed before the first batch was saved whole
-                return NO_ROWS, []
             columns = pd.read_csv(self.csv, nrows=0).columns
             if absent := [column for column in types if column not in columns]:
                 raise ResultsError(
@@ -147,12 +141,30 @@ class Store:
             rows = pd.read_csv(self.csv, dtype=types, keep_default_na=False)
         except ResultsError:
             raise
-        except (ValueError, KeyError, TypeError, AttributeError, OSError) as error:
+        except (ValueError, OSError) as error:
             raise ResultsError(f"{self.json.with_suffix('')}: cannot be read: {error}") from error
         # Rows that no batch claims: the run was killed between the two renames. They are
         # computed again.
         parts = [self._checked(rows, batch) for batch in batches]
         return pd.concat(parts, ignore_index=True), batches
+
+    def _record(self) -> tuple[dict[str, str], list[Batch]]:
+        """The types of the columns, and the batches."""
+        if not self.json.exists():
+            if self.csv.exists():
+                raise ResultsError(
+                    f"{self.csv}: has no {self.json.name} beside it that says where it comes from"
+                )
+            return {}, []
+        try:
+            record = json.loads(self.json.read_text(encoding="utf-8"))
+            types, batches = dict(record["types"]), list(record["batches"])
+            for batch in batches:
+                if absent := KEYS - batch.keys():
+                    raise KeyError(f"a batch without {min(absent)}")
+        except (ValueError, KeyError, TypeError, AttributeError, OSError) as error:
+            raise ResultsError(f"{self.json.with_suffix('')}: cannot be read: {error}") from error
+        return types, batches
 
     def _checked(self, rows: pd.DataFrame, batch: Batch) -> pd.DataFrame:
         part = select(rows[rows["run"].isin(batch["seeds"])], batch["columns"])
@@ -171,7 +183,7 @@ class Store:
         if not chosen:
             return
         wanted = asked(experiment, cell, chosen)
-        recorded = {key: batch[key] for key in wanted}
+        recorded = {key: batch[key] for key in wanted} | {"cell": filled(experiment, batch["cell"])}
         recorded["reads"] = {
             name: read for name, read in batch["reads"].items() if name in wanted["reads"]
         }
@@ -214,11 +226,12 @@ class Store:
             together = pd.concat([present, rows]) if len(present) else rows
             together = together.sort_values(order, kind="stable")[list(rows.columns)]
             if not self.json.exists():  # a CSV without a JSON would be somebody else's
-                self._write_record(rows, [])
+                self.write_record(rows, [])
             replace_text(self.csv, together.to_csv(index=False))
-            self._write_record(together, batches)
+            self.write_record(together, batches)
 
-    def _write_record(self, rows: pd.DataFrame, batches: list[Batch]) -> None:
+    def write_record(self, rows: pd.DataFrame, batches: list[Batch]) -> None:
+        """Replace the record of these rows."""
         types = {column: _type(rows[column]) for column in rows.columns}
         record = {"types": types, "batches": batches}
         replace_text(self.json, json.dumps(record, indent=1) + "\n")
@@ -251,6 +264,14 @@ def asked(experiment: Experiment, cell: Cell, seeds: Sequence[int]) -> dict[str,
     digests = {path.name: origin.file_digest(path) for path in paths}
     made_of = {"cell": asdict(cell), "run": name, "options": options, "reads": digests}
     return json.loads(json.dumps(made_of))
+
+
+def filled(experiment: Experiment, recorded: dict[str, Any]) -> dict[str, Any]:
+    """A recorded cell with options that it did not have yet: their defaults are what was done."""
+    try:
+        return json.loads(json.dumps(asdict(rebuilt(experiment.cell, recorded))))
+    except (TypeError, ValueError, KeyError):  # it has options that are no more
+        return recorded
 
 
 def select(rows: pd.DataFrame, columns: dict[str, Any]) -> pd.DataFrame:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 from pandas.io.formats.style import Styler
 
 from experiments.store import Store
+from ipo.stats import bootstrap_interval
 
 
 def show(frame: pd.DataFrame, formats: dict[str, str] | str | None = None) -> Styler:
@@ -37,3 +39,53 @@ def costs(folder: str | Path, names: Sequence[str]) -> Styler:
         }
 
     return show(pd.DataFrame(map(row, names)), {"CPU minutes": "{:.1f}"})
+
+
+def beside_shipped(live: pd.DataFrame, shipped: pd.DataFrame) -> pd.DataFrame:
+    """Live rows with the shipped ones of the same keys, and how far they are apart.
+
+    Raises:
+        ValueError: a live row of which none is shipped.
+    """
+    keys = [column for column in live.columns if column != "value"]
+    both = live.rename(columns={"value": "live"}).merge(
+        shipped.rename(columns={"value": "shipped"}), on=keys, how="left", validate="one_to_one"
+    )
+    if both["shipped"].isna().any():
+        first = both.loc[both["shipped"].isna(), keys].iloc[0].to_dict()
+        raise ValueError(f"shipped: has no row for {first}, must have one for each live row")
+    return both.assign(**{"relative difference": (both["live"] / both["shipped"] - 1).abs()})
+
+
+def mean_and_interval(values: pd.Series, digits: int = 2) -> str:
+    """Of runs, with the 95 % interval of the mean."""
+    low, high = bootstrap_interval(values.to_numpy(), np.random.default_rng(0))
+    return f"{values.mean():.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
+
+
+def by_method(
+    rows: pd.DataFrame, columns: str, names: Mapping[str, str], digits: int = 2
+) -> pd.DataFrame:
+    """A line for each method in the order of its ``names``, a column for each value of a column.
+
+    What stands there is :func:`mean_and_interval` of all runs.
+    """
+    groups = rows.groupby(["method", columns])["value"]
+    wide = groups.apply(mean_and_interval, digits=digits).unstack()
+    present = [method for method in names if method in wide.index]
+    return wide.reindex(present).rename(index=names).rename_axis("method")
+
+
+def largest_differences(
+    recorded: pd.DataFrame, now: pd.DataFrame, by: Sequence[str]
+) -> pd.DataFrame:
+    """By how much rows differ from the recorded ones: the largest relative difference, by groups.
+
+    Infinite where a row was never recorded.
+    """
+    keys = [column for column in recorded.columns if column != "value"]
+    both = now.merge(recorded, "left", keys, suffixes=("_now", ""), validate="one_to_one")
+    difference = (both["value_now"] - both["value"]).abs() / (both["value"].abs() + 1e-3)
+    both = both.assign(difference=difference.fillna(np.inf))
+    largest = both.groupby(list(by), sort=False)["difference"].max().reset_index()
+    return largest.rename(columns={"difference": "largest relative difference"})

@@ -23,7 +23,8 @@ def test_how_to_runs_with_the_installed_package_alone(tmp_path):
     parameters = "\n".join(f"{name} = {value}" for name, value in small.items())
     first, *others = sources  # the parameters, then what they are replaced by
     script = elsewhere / "how_to.py"
-    script.write_text("\n\n".join(["In = []", first, parameters, *others]))
+    alone = "import sys\nsys.modules['experiments'] = None  # the book's package is not there"
+    script.write_text("\n\n".join([alone, "In = []", first, parameters, *others]))
     where = "\nimport ipo\nprint('installed in', ipo.__file__)\n"
     script.write_text(script.read_text() + where)
     done = subprocess.run(

@@ -10,8 +10,10 @@ import numpy as np
 import pandas as pd
 import pytest
 import scipy.stats
+from stored_rows import store_rows
 
 import claims
+from experiments.store import ResultsError, Store
 from rules import RULES
 
 COLUMNS = [
@@ -35,15 +37,13 @@ def rows(method, num_domains, dim_distractor, mean, optimizer="adam", spread=0.3
 
 
 def write(data: Path, name: str, lines: list[tuple]) -> None:
-    path = data / "results" / f"{name}.csv"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    pd.DataFrame(lines, columns=COLUMNS).to_csv(path, index=False)
+    store_rows(data, name, pd.DataFrame(lines, columns=COLUMNS))
 
 
 def edit(data: Path, name: str, change) -> None:
     """Pass the rows of a result through a function."""
-    path = data / "results" / f"{name}.csv"
-    change(pd.read_csv(path)).to_csv(path, index=False)
+    chapter, _, file = name.partition("/")
+    store_rows(data, name, change(Store(data / "results" / chapter, file).rows()))
 
 
 def verdict(data: Path, name: str) -> str:
@@ -92,9 +92,16 @@ def test_a_cell_with_a_missing_run_does_not_count(data):
     assert "9 of 10 runs" in finding.evidence
 
 
+def test_a_verdict_is_not_flipped_by_hand(data):
+    path = data / "results" / "lqr" / "tables.csv"
+    path.write_text(path.read_text().replace("97.", "57.", 1))
+    with pytest.raises(ResultsError, match=r"tables\.csv: the rows .* are cut short or changed"):
+        claims.decide_all(data)
+
+
 def test_a_missing_column_is_an_error_that_names_it(data):
     edit(data, "lqr/tables", lambda table: table.drop(columns="optimizer"))
-    with pytest.raises(ValueError, match=r"tables\.csv.*optimizer"):
+    with pytest.raises(ValueError, match=r"lqr/tables: no column.*optimizer"):
         claims.decide_all(data)
 
 
@@ -219,9 +226,7 @@ def write_keys(data: Path, cells: dict[tuple[str, str], tuple[float, float]]) ->
             for run in range(100):
                 value = mean + spread * scipy.stats.norm.ppf((run + 0.5) / 100)
                 lines.append((method, "red+green", "integer", 5, run, domain, metric, value))
-    path = data / "results" / "keys" / "main.csv"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    pd.DataFrame(lines, columns=KEYS).to_csv(path, index=False)
+    store_rows(data, "keys/main", pd.DataFrame(lines, columns=KEYS))
 
 
 def training_colors(mean: float) -> dict:
@@ -290,9 +295,7 @@ def write_door(data: Path, name: str, cells: dict, metric: str = "success") -> N
         for run, noise in enumerate(np.linspace(-spread, spread, 10))
         for door, move in ((0, -0.001), (1, 0.001))
     ]
-    path = data / "results" / "door" / f"{name}.csv"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    pd.DataFrame(lines, columns=DOOR).to_csv(path, index=False)
+    store_rows(data, f"door/{name}", pd.DataFrame(lines, columns=DOOR))
 
 
 def door_table(data: Path, change: float) -> dict:

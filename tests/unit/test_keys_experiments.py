@@ -27,8 +27,9 @@ from experiments.keys import (
     run_curve,
     runs_of,
 )
+from experiments.policies import load_policy
 from experiments.store import Batch, Store
-from ipo.networks import GridNetwork, load_policy
+from ipo.networks import GridNetwork
 from ipo.worlds.colored_keys import COLORS
 from ipo.worlds.tabular import TabularTask, expected_return, occupancy
 

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pandas as pd
@@ -15,6 +16,7 @@ import pytest
 import toy_experiment
 from toy_experiment import CELLS, SEEDS, Cell, fill
 
+from experiments.experiment import Experiment
 from experiments.store import OriginError, ResultsError, Store
 
 
@@ -289,6 +291,26 @@ def refused(folder: Path, message: str, **asked) -> None:
 def test_rows_of_other_parameters_are_refused(folder):
     message = r"toy\.csv: the rows of .*'size': 2}.*cell\.power = 0\.5, asked for 0\.25.*move toy"
     refused(folder, message, cells=[*NEW_POWER, Cell("new", 1)])
+
+
+def test_an_option_that_rows_did_not_have_yet_is_its_default(folder):
+    @dataclass(frozen=True)
+    class NewCell(Cell):
+        """With an option that the recorded cells lack."""
+
+        offset: float = 0.0
+
+    new = [NewCell(cell.method, cell.size) for cell in CELLS]
+    store, experiment = Store(folder, "toy"), Experiment(toy_experiment.run, NewCell)
+    assert len(store.fill(experiment, new, SEEDS)) == 18
+    with pytest.raises(OriginError, match=r"cell\.offset = 0\.0, asked for 1\.0"):
+        store.fill(experiment, [replace(new[0], offset=1.0)], SEEDS)
+
+
+def test_an_option_that_is_no_more_is_named(folder):
+    text = (folder / "toy.json").read_text()
+    (folder / "toy.json").write_text(text.replace('"power": 0.5', '"root": 2'))
+    refused(folder, r"cell\.power = None, asked for 0\.5; cell\.root = 2, asked for None")
 
 
 def test_rows_of_another_run_function_are_refused(folder):
