@@ -418,11 +418,13 @@ def by_update(both: pd.DataFrame) -> pd.DataFrame:
     Means over runs, shipped and live, and the largest difference of any run.
     """
     columns = {}
-    means = both.groupby(["domain", "method", "frames"])[["value_shipped", "value"]].mean()
+    groups = both.groupby(["domain", "method", "frames"], sort=False)
+    means = groups[["value_shipped", "value"]].mean()
     for color in both["domain"].unique():
         columns[f"{color}, shipped"] = means.loc[color]["value_shipped"]
         columns[f"{color}, live"] = means.loc[color]["value"]
-    columns["largest difference"] = both.groupby(["method", "frames"])["difference"].max()
+    by_arm = both.groupby(["method", "frames"], sort=False)
+    columns["largest difference"] = by_arm["difference"].max()
     return pd.DataFrame(columns).rename(index=MAIN).rename_axis(["arm", "frames"]).reset_index()
 
 
@@ -539,19 +541,15 @@ def beyond_codes(
     """Exact returns in the grey domain where key and door, and walls, are seen in other codes."""
     table = task.tasks[TESTED]
 
-    def returns_with(players: Sequence[Weights], **kinds: int) -> np.ndarray:
-        logits = task.logits(players, recolor(table.images, kinds))
-        return expected_return(table, logits.softmax(-1).numpy())[0]
+    def policy(players: Sequence[Weights], **kinds: int) -> np.ndarray:
+        return task.logits(players, recolor(table.images, kinds)).softmax(-1).numpy()
 
-    return pd.concat(
-        _by_run(
-            returns_with(players, key=code, door=code, wall=wall),
-            method=method, wall=wall, code=code,
-        )
-        for method, players in saved.items()
-        for wall in walls
-        for code in codes
-    )  # fmt: skip
+    parts = []
+    for (method, players), wall in itertools.product(saved.items(), walls):
+        policies = [policy(players, key=code, door=code, wall=wall) for code in codes]
+        for code, values in zip(codes, _returns_of(table, policies), strict=True):
+            parts.append(_by_run(values, method=method, wall=wall, code=code))
+    return pd.concat(parts)
 
 
 def by_temperature(
@@ -562,18 +560,24 @@ def by_temperature(
 ) -> pd.DataFrame:
     """Exact returns where scores are divided by a temperature; at 0 the best action is taken."""
 
-    def rows(method: str, color: str) -> Iterator[pd.DataFrame]:
-        table = task.tasks[color]
-        logits = task.logits(saved[method], table.images).numpy()
-        for temperature in temperatures:
-            if temperature == 0:
-                policy = np.eye(logits.shape[-1])[logits.argmax(-1)]
-            else:
-                policy = scipy.special.softmax(logits / temperature, axis=-1)
-            values = expected_return(table, policy)[0]
-            yield _by_run(values, method=method, domain=color, temperature=temperature)
+    def policy(logits: np.ndarray, temperature: float) -> np.ndarray:
+        if temperature == 0:
+            return np.eye(logits.shape[-1])[logits.argmax(-1)]
+        return scipy.special.softmax(logits / temperature, axis=-1)
 
-    return pd.concat(part for method in saved for color in colors for part in rows(method, color))
+    parts = []
+    for (method, players), color in itertools.product(saved.items(), colors):
+        table = task.tasks[color]
+        logits = task.logits(players, table.images).numpy()
+        policies = [policy(logits, temperature) for temperature in temperatures]
+        for temperature, values in zip(temperatures, _returns_of(table, policies), strict=True):
+            parts.append(_by_run(values, method=method, domain=color, temperature=temperature))
+    return pd.concat(parts)
+
+
+def _returns_of(table: TabularTask, policies: Sequence[np.ndarray]) -> np.ndarray:
+    """Exact returns ``[len(policies), R]`` of policies ``[R, K, A]``, all at once."""
+    return expected_return(table, np.concatenate(policies))[0].reshape(len(policies), -1)
 
 
 def _by_run(values: np.ndarray, **columns: Any) -> pd.DataFrame:
