@@ -160,8 +160,10 @@ class DenseNetwork(Network):
 
         def policy(observations: Tensor) -> Outputs:
             x = observations.numpy()
-            parameters = sum(outputs(own, "actor", x) for own in weights) / len(weights)
-            values = sum(outputs(own, "critic", x) for own in weights)[..., 0] / len(weights)
+            parameters = np.sum([outputs(own, "actor", x) for own in weights], 0) / len(weights)
+            values = np.sum([outputs(own, "critic", x) for own in weights], 0)[..., 0] / len(
+                weights
+            )
             if deviation is not None:
                 spread = np.broadcast_to(deviation, parameters.shape)
                 parameters = np.concatenate([parameters, spread], -1)

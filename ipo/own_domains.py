@@ -19,7 +19,7 @@ import gymnasium
 import numpy as np
 import pandas as pd
 import torch
-from gymnasium.spaces import Box, Discrete, Space
+from gymnasium.spaces import Box, Discrete, Space, flatdim
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import ClipAction
 from torch import Tensor
@@ -69,7 +69,7 @@ def default_settings(method: str, num_domains: int, **changes: Any) -> PPOSettin
     every method, so that all of them see the same number of frames.
     """
     square = num_domains**2
-    sensible = {
+    sensible: dict[str, Any] = {
         "learning_rate": PPO_RATE if method == "ppo" else IPO_RATE,
         "num_envs": square * math.ceil(30 / square),
         "num_epochs": 8,
@@ -176,10 +176,9 @@ def compare(
 
 def network_for(observations: Space, actions: Space) -> DenseNetwork:
     """An actor-critic whose sizes fit the spaces."""
-    size = observations.shape[0]
     if isinstance(actions, Discrete):
-        return DenseNetwork(size, int(actions.n), Categorical)
-    return DenseNetwork(size, actions.shape[0], Gaussian)
+        return DenseNetwork(flatdim(observations), int(actions.n), Categorical)
+    return DenseNetwork(flatdim(observations), flatdim(actions), Gaussian)
 
 
 def check_domains(name: str, domains: Domains, minimum: int = 1) -> tuple[Space, Space]:

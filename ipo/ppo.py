@@ -235,13 +235,11 @@ class Training:
             skip = settings.skip_last_frames and epoch % 2 == 1
             for chosen in minibatches(frames, settings, self.orders, skip):
                 batch = Rollout(*(x[runs, chosen] for x in frames))
-                outputs = self.network(player, batch.observations)
+                parameters, values = self.network(player, batch.observations)
                 if others:
-                    outputs = [
-                        part[runs, chosen] + share * own
-                        for part, own in zip(others, outputs, strict=True)
-                    ]
-                loss = clipped_loss(self.network.distribution, *outputs, batch, settings)
+                    parameters = others[0][runs, chosen] + share * parameters
+                    values = others[1][runs, chosen] + share * values
+                loss = clipped_loss(self.network.distribution, parameters, values, batch, settings)
                 self._descend(d, loss)
 
     def _others(self, d: int, observations: Tensor) -> list[Tensor]:

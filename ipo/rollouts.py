@@ -65,7 +65,7 @@ class FromGymnasium:
         self.seeds = [int(stream.generate_state(1)[0]) for stream in streams]
 
     def reset(self) -> Tensor:
-        return self._by_run(self.envs.reset(seed=self.seeds)[0])
+        return self._by_run(self.envs.reset(seed=self.seeds)[0])  # type: ignore[arg-type]
 
     def step(self, actions: Tensor) -> Step:
         answer = self.envs.step(actions.flatten(0, 1).numpy())
@@ -83,10 +83,10 @@ class FromGymnasium:
 
     def state(self) -> dict[str, Any]:
         """Of environments that have one."""
-        return self.envs.state()
+        return self.envs.state()  # type: ignore[attr-defined]
 
     def restore(self, state: dict[str, Any]) -> None:
-        self.envs.restore(state)
+        self.envs.restore(state)  # type: ignore[attr-defined]
 
     def _by_run(self, values: np.ndarray) -> Tensor:
         return torch.tensor(values, dtype=torch.float32).unflatten(0, (self.num_runs, -1))
@@ -209,13 +209,13 @@ class Collector:
         """All that changes; the environments must have a state."""
         scale = self.normalizer and [self.normalizer.discounted, self.normalizer.moments]
         return {
-            "environments": self.environments.state(),
+            "environments": self.environments.state(),  # type: ignore[attr-defined]
             "observation": self.observation,
             "scale": scale,
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        self.environments.restore(state["environments"])
+        self.environments.restore(state["environments"])  # type: ignore[attr-defined]
         self.observation = state["observation"]
         if self.normalizer is not None:
             self.normalizer.discounted, self.normalizer.moments = state["scale"]

@@ -37,7 +37,7 @@ TOLERANCE = {
     "algorithm": (1e-6, 1e-9),
     "keys": (1e-3, 1e-5),
     "door": (1e-3, 1e-5),
-    "your_own_domains": (1e-3, 1e-3),
+    "your_own_domains": (1e-2, 1e-3),  # episodes of a pendulum are chaotic
 }
 # One draw, one label or one door can flip where two numbers are nearly the same.
 FLIPS = {
@@ -46,7 +46,7 @@ FLIPS = {
     "validation_error": 0.005,
     "test_error": 0.005,
 }
-SHOWN = ("iteration", "frames", "update", "run", "domain", "door", "metric")
+SHOWN = ("method", "iteration", "frames", "update", "run", "domain", "door", "metric")
 
 
 @dataclass(frozen=True)
@@ -132,7 +132,7 @@ def within(both: pd.DataFrame, chapter: str, factor: float = 1.0) -> pd.Series:
 
 
 def describe(row: dict[str, object]) -> str:
-    """Which row it is, beside the columns of its cell."""
+    """Which row it is."""
     return ", ".join(f"{key} {row[key]}" for key in SHOWN if key in row)
 
 
