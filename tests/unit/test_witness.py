@@ -57,7 +57,7 @@ def test_a_change_is_named_with_cell_metric_and_values(toy, monkeypatch, shift, 
     problems = witness.verify(num_workers=1)
     assert len(problems) == count
     if count:
-        line = "lqr/toy, {'method': 'fast', 'size': 10}: method fast, run 0, domain train, metric cost:"
+        line = "lqr/toy, {'method': 'fast', 'size': 10}: method fast, run 0, domain train, metric"
         assert any(problem.startswith(line) for problem in problems)
         assert all("recorded" in problem and "now" in problem for problem in problems)
 
