@@ -12,6 +12,8 @@ Whoever changes results on purpose records the slices again, and says so in the 
 from __future__ import annotations
 
 import argparse
+import contextlib
+import io
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -89,7 +91,8 @@ def verify(names: Sequence[str] = (), num_workers: int = -1) -> list[str]:
 
 def _attempt(part: Slice, scratch: Path) -> pd.DataFrame | str:
     try:
-        return part.run(scratch)
+        with contextlib.redirect_stderr(io.StringIO()):  # bars of single trainings
+            return part.run(scratch)
     except Exception as error:  # whatever it is, it is a difference, and the others go on
         return f"{type(error).__name__}: {error}"
 
