@@ -43,11 +43,11 @@ serve: setup ## the built site on http://localhost:8000
 lab: setup ## the notebooks in JupyterLab
 	@$(IN_VENV) -m jupyterlab
 
-lint: setup ## ruff's checks and format, without changing anything
-	@$(IN_VENV) -m ruff check && $(IN_VENV) -m ruff format --check
+lint: setup ## ruff's checks and format, and the types of ipo/, without changing anything
+	@$(IN_VENV) -m ruff check && $(IN_VENV) -m ruff format --check && $(IN_VENV) -m mypy
 
 format: setup ## ruff's format and safe repairs
 	@$(IN_VENV) -m ruff check --fix && $(IN_VENV) -m ruff format
 
 clean: ## remove what was built; the environment and data/ stay
-	@rm -rf book/_build book/_executed .pytest_cache .ruff_cache .hypothesis
+	@rm -rf book/_build book/_executed .pytest_cache .ruff_cache .mypy_cache .hypothesis

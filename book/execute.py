@@ -33,6 +33,7 @@ import sources
 
 WORKER = "import json, sys, papermill; papermill.execute_notebook(**json.loads(sys.argv[1]))"
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+DATA = ("paper", "results", "policies", "witness", "bench")  # what notebooks read
 ANSI = re.compile(r"\x1b\[[0-9;]*m")
 
 
@@ -148,12 +149,8 @@ def fingerprint(notebook: Notebook) -> str:
     cells = [cell for cell in notebook.read().cells if cell.cell_type == "code"]
     code = [[cell.source, cell.metadata.get("tags", [])] for cell in cells]
     python = TransformerManager().transform_cell("\n".join(cell.source for cell in cells))
-    folders = (
-        notebook.root / "data" / "paper",
-        notebook.root / "data" / "results" / notebook.name,
-        notebook.root / "data" / "policies" / notebook.name,
-        notebook.root / "data" / "bench",
-    )
+    # All of it, not only the chapter's own: one chapter may show what another one has computed.
+    folders = [notebook.root / "data" / name for name in DATA]
     everything = {
         "code": code,
         "parameters": notebook.parameters,

@@ -11,6 +11,7 @@ from pathlib import Path
 import nbformat
 
 import claims
+import provenance
 from execute import BuildError, Notebook, for_terminal, replace_text, tree_hash
 
 NUM_SLOWEST_CELLS = 8
@@ -47,6 +48,7 @@ def stage(root: Path, source: Path, notebooks: list[Notebook], profile: str) -> 
         nbformat.write(notebook.read_executed(), source / f"{notebook.name}.ipynb")
     (source / "run_times.md").write_text(run_times_page(notebooks, profile), encoding="utf-8")
     claims.write_fragments(source)
+    provenance.write_fragment(source)
 
 
 def run_jupyter_book(source: Path, output: Path) -> Path:

@@ -1,12 +1,47 @@
 """Invariant Policy Optimization: the algorithms behind the reproducibility book.
 
-Import the module that you need (``from ipo import lqr``); nothing heavy is imported here. The
-environments are registered with gymnasium: ``gymnasium.make("ipo/ColoredKeys-v0", color="grey")``.
+An evening's reading, in this order:
+
+    game            who owns which domains, a round of Algorithm 1, linear players, the Nash gap
+    optimizers      how a player takes a step
+    lqr             linear quadratic control with distractors: the problem and its exact cost
+    lqr_learners    the four methods of the paper's LQR tables, as that game
+    distributions   what a network's outputs say of actions
+    networks        policies and critics, and the average of several players' outputs
+    rollouts        experience in many environments at once, and advantages
+    ppo             PPO, IPO and the ensemble: that game between networks
+    own_domains     the same for environments of your own
+    stats           intervals and comparisons over runs
+    checks          errors that name the parameter, its value and the rule
+
+Then, as a chapter needs them:
+
+    causality       causal models, invariant predictors, IRM-Games, ICP, games of two numbers
+    worlds          coloured keys and doors
+
+Import what you need (``from ipo import lqr``); nothing heavy is imported here. The environments
+are registered with gymnasium: ``gymnasium.make("ipo/ColoredKeys-v0", color="grey")``.
 """
 
 from gymnasium import register
 
 __version__ = "0.1.0"
+
+__all__ = [
+    "causality",
+    "checks",
+    "distributions",
+    "game",
+    "lqr",
+    "lqr_learners",
+    "networks",
+    "optimizers",
+    "own_domains",
+    "ppo",
+    "rollouts",
+    "stats",
+    "worlds",
+]
 
 register("ipo/ColoredKeys-v0", entry_point="ipo.worlds.colored_keys:ColoredKeysEnv")
 register("ipo/Door-v0", entry_point="ipo.worlds.door:DoorEnv")

@@ -6,6 +6,7 @@ import ast
 import difflib
 import itertools
 import math
+import operator
 from collections.abc import Iterable, Sequence
 from numbers import Integral, Real
 
@@ -19,17 +20,27 @@ def check_count(name: str, value: object, minimum: int = 1) -> None:
 
 
 def check_number(
-    name: str, value: object, *, above: float | None = None, least: float | None = None
+    name: str,
+    value: object,
+    *,
+    above: float | None = None,
+    least: float | None = None,
+    below: float | None = None,
+    most: float | None = None,
 ) -> None:
-    """A real number that is not NaN, above ``above`` or at least ``least``."""
+    """A real number that is not NaN, within the bounds that are given."""
     if isinstance(value, bool) or not isinstance(value, Real):
         raise TypeError(f"{name} = {value!r}: must be a number, not {type(value).__name__}")
     if math.isnan(value):
         raise ValueError(f"{name} = {value!r}: must not be NaN")
-    if above is not None and value <= above:
-        raise ValueError(f"{name} = {value!r}: must be greater than {above}")
-    if least is not None and value < least:
-        raise ValueError(f"{name} = {value!r}: must be at least {least}")
+    for bound, holds, rule in (
+        (above, operator.gt, "greater than"),
+        (least, operator.ge, "at least"),
+        (below, operator.lt, "less than"),
+        (most, operator.le, "at most"),
+    ):
+        if bound is not None and not holds(value, bound):
+            raise ValueError(f"{name} = {value!r}: must be {rule} {bound}")
 
 
 def check_choice(name: str, value: object, choices: Iterable[str]) -> None:

@@ -14,14 +14,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
+Generators = Sequence[np.random.Generator]  # one for each run
+
 LOG_SQRT_TAU = 0.5 * math.log(2 * math.pi)
 
 
 class Distribution(Protocol):
-    """What training needs of a distribution over actions; R runs, each with its own generator."""
+    """What training needs of a distribution over actions."""
 
     @staticmethod
-    def sample(parameters: Tensor, generators: Sequence[np.random.Generator]) -> Tensor:
+    def sample(parameters: Tensor, generators: Generators) -> Tensor:
         """Actions for ``parameters [R, N, P]``."""
 
     @staticmethod
@@ -41,7 +43,7 @@ class Categorical:
     """A of a finite set; the parameters are its logits ``[..., A]``, an action is a number."""
 
     @staticmethod
-    def sample(parameters: Tensor, generators: Sequence[np.random.Generator]) -> Tensor:
+    def sample(parameters: Tensor, generators: Generators) -> Tensor:
         uniform = np.stack([generator.random(parameters.shape[1]) for generator in generators])
         below = parameters.softmax(-1).cumsum(-1)[..., :-1]  # rounding must not lead too far
         return (torch.tensor(uniform, dtype=below.dtype).unsqueeze(-1) > below).sum(-1)
@@ -71,7 +73,7 @@ class Gaussian:
     """
 
     @staticmethod
-    def sample(parameters: Tensor, generators: Sequence[np.random.Generator]) -> Tensor:
+    def sample(parameters: Tensor, generators: Generators) -> Tensor:
         mean, deviation = parameters.chunk(2, -1)
         noise = [generator.standard_normal(mean.shape[1:]) for generator in generators]
         return mean + deviation * torch.tensor(np.stack(noise), dtype=mean.dtype)

@@ -1,9 +1,15 @@
-"""The game behind IPO: players, their average, rounds of best responses, and the Nash gap.
+"""The game behind IPO: who owns which domains, one round of Algorithm 1, and the Nash gap.
 
-Every domain has a player. The players' policies are averaged, and the average acts in all
-domains. In a round each player in turn changes its own weights so that *its* domain's cost
-falls, while the others stand still. Pooled training is the same game with one player that
-owns all domains.
+Every player owns some training domains. The players' policies are averaged, and the average acts
+in all domains. In a round each player in turn changes its own weights so that the cost of *its*
+domains falls, while the others stand still. All methods of the book are this game:
+
+    pooled training (gradient descent, PPO)     one player that owns all domains
+    IPO, IRM-Games                              a player for each domain
+    ensemble                                    as many players, each of which owns all domains
+
+Players are linear controllers and predictors (:class:`LinearPlayers`, here) or networks
+(:mod:`ipo.ppo`); they all play :func:`play_round`.
 
 Source: Algorithm 1 of Sonar, Pacelli and Majumdar (2021), after Ahuja et al. (2020).
 """
@@ -16,8 +22,12 @@ import torch
 from torch import Tensor
 
 from ipo.checks import check_choice, check_count
+from ipo.optimizers import descend
 
-METHODS = ("pooled", "ipo", "ensemble")  # who owns which domains
+OWNERSHIPS = ("pooled", "ipo", "ensemble")
+ORDERS = ("in_turn", "together")
+
+Cost = Callable[[Tensor], Tensor]  # policy [R, ...] -> [R]
 
 
 def domains_of_players(method: str, num_domains: int) -> list[list[int]]:
@@ -26,7 +36,7 @@ def domains_of_players(method: str, num_domains: int) -> list[list[int]]:
     ``pooled`` is one player that owns all; in ``ipo`` each domain has a player of its own; an
     ``ensemble`` has as many players as ``ipo``, and each owns all domains.
     """
-    check_choice("method", method, METHODS)
+    check_choice("method", method, OWNERSHIPS)
     check_count("num_domains", num_domains)
     everything = list(range(num_domains))
     return {
@@ -58,52 +68,90 @@ def play_round(
             respond(d)  # lines 9 and 10: what the next player sees is the new average
 
 
-def new_players(num_runs: int, num_players: int, shape: Sequence[int], **options) -> Tensor:
-    """Weights of all players, zero: ``[runs, players, *shape]``.
-
-    In memory the player axis comes first, so that the weights of one player are contiguous
-    and its optimiser updates them in place at full speed.
-    """
-    return torch.zeros(num_players, num_runs, *shape, **options).transpose(0, 1)
-
-
-def split_players(players: Tensor) -> list[Tensor]:
-    """One leaf ``[runs, ...]`` per player, sharing memory with ``[runs, players, ...]``."""
-    return [player.detach().requires_grad_() for player in players.unbind(dim=1)]
-
-
 def average(players: Tensor) -> Tensor:
-    """The averaged policy that acts: ``[runs, players, ...] -> [runs, ...]``.
+    """The averaged policy that acts: ``[R, E, ...] -> [R, ...]``.
 
     pi_av = (1 / n_d) sum_d pi_d        (Section 4 of the paper)
     """
     return players.mean(dim=1)
 
 
-def best_response_round(
-    players: Sequence[Tensor],
-    policy: Tensor,
-    respond: Callable[[int, Callable[[], Tensor]], None],
-) -> None:
-    """One round: in order, every player moves once while the others stand still.
+class LinearPlayers:
+    """Players with policies that are linear in their weights: averaging weights averages policies.
 
-    Lines 8 to 11 of Algorithm 1. A player sees its own weights only through the average,
+    A player moves by one step of an optimiser of its own, down a cost of the average. It sees its
+    own weights only through the average,
 
         pi_av = others_d + pi_d / n_d,
 
     so its gradient carries the factor ``1 / n_d``.
 
     Args:
-        players: the leaves of :func:`split_players`, updated in place.
-        policy: their average ``[runs, ...]``, updated in place.
-        respond: ``respond(d, policy_of_d)`` makes player d's move; ``policy_of_d()`` is the
-            average as a function of the present weights of player d, and of them alone.
+        starts: the players' first weights ``[R, E, ...]``.
+        optimizer: makes a player's optimiser of its weights ``[R, ...]``.
+        bound: players stay within ``[-bound, bound]`` in every weight; ``None``: no bound.
+        max_gradient_norm: bound on the norm of each player's gradient, run by run.
+        order: ``in_turn`` (Algorithm 1), or ``together``: everybody at the same average.
+
+    Attributes:
+        players: the weights of each, ``[R, ...]``; they change in place.
+        policy: their average ``[R, ...]``, which acts; it changes in place.
     """
-    share = 1 / len(players)
-    for d, player in enumerate(players):
-        policy.sub_(player.detach(), alpha=share)  # now the others' part; in place, it is large
-        respond(d, lambda player=player: policy.add(player, alpha=share))
-        policy.add_(player.detach(), alpha=share)
+
+    def __init__(
+        self,
+        starts: Tensor,
+        optimizer: Callable[[Sequence[Tensor]], torch.optim.Optimizer],
+        bound: float | None = None,
+        max_gradient_norm: float | None = None,
+        order: str = "in_turn",
+    ) -> None:
+        check_choice("order", order, ORDERS)
+        # One contiguous block for each player: its optimiser updates it at full speed.
+        self.players = [
+            start.clone(memory_format=torch.contiguous_format).requires_grad_()
+            for start in starts.detach().unbind(1)
+        ]
+        self.policy = average(self.weights)
+        self.optimizers = [optimizer([player]) for player in self.players]
+        self.bound, self.max_gradient_norm, self.order = bound, max_gradient_norm, order
+
+    @property
+    def weights(self) -> Tensor:
+        """A copy of the weights of all players ``[R, E, ...]``."""
+        return torch.stack([player.detach() for player in self.players]).transpose(0, 1)
+
+    def round(
+        self,
+        costs: Sequence[Cost],
+        num_inner_rounds: int = 1,
+        move_phi: Callable[[], None] | None = None,
+    ) -> None:
+        """One iteration of Algorithm 1, where player d wants ``costs[d](policy)`` to be low."""
+        move = self._move_in_turn if self.order == "in_turn" else self._move_together
+        play_round(len(self.players), lambda d: move(d, costs[d]), num_inner_rounds, move_phi)
+
+    def _move_in_turn(self, d: int, cost: Cost) -> None:
+        """Player d steps; the average holds its new weights before the next player moves."""
+        player, share = self.players[d], 1 / len(self.players)
+        self.policy.sub_(
+            player.detach(), alpha=share
+        )  # now the others' part; in place: it is large
+        self._step(d, lambda: cost(self.policy.add(player, alpha=share)))
+        self.policy.add_(player.detach(), alpha=share)
+
+    def _move_together(self, d: int, cost: Cost) -> None:
+        """Player d steps; the average changes when the last has moved."""
+        player, share = self.players[d], 1 / len(self.players)
+        others = self.policy - share * player.detach()
+        self._step(d, lambda: cost(others + share * player))
+        if d == len(self.players) - 1:
+            self.policy.copy_(average(self.weights))
+
+    def _step(self, d: int, objective: Callable[[], Tensor]) -> None:
+        descend(self.optimizers[d], objective, self.max_gradient_norm)
+        if self.bound is not None:
+            self.players[d].detach().clamp_(-self.bound, self.bound)
 
 
 def nash_gap(costs: Tensor, best_costs: Tensor) -> Tensor:
@@ -112,10 +160,10 @@ def nash_gap(costs: Tensor, best_costs: Tensor) -> Tensor:
         gap = max_d [ J_d(pi_av) - min over pi_d of J_d(pi_av) ]
 
     Args:
-        costs: ``[runs, players]``, every player's cost at the current average.
+        costs: ``[R, E]``, every player's cost at the current average.
         best_costs: the same at that player's best response to the others.
 
     Returns:
-        ``[runs]``; zero exactly at a Nash equilibrium.
+        ``[R]``; zero exactly at a Nash equilibrium.
     """
     return (costs - best_costs).amax(dim=1)

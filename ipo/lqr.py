@@ -14,8 +14,9 @@ Tensors have the leading axes runs R and, where they differ by domain, domains E
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import scipy.linalg
@@ -67,7 +68,7 @@ class LQR:
         """Observations of the training domains ``[R, E, n_o, n_x]``."""
         return split_domains(self.seen, self.num_domains)
 
-    def _map(self, change) -> LQR:
+    def _map(self, change: Callable[[Tensor], Tensor]) -> LQR:
         return replace(self, **{name: change(getattr(self, name)) for name in vars(self)})
 
     def run(self, r: int) -> LQR:
@@ -174,7 +175,7 @@ class _StateFeedbackCost(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx, F: Tensor, A: Tensor, B: Tensor, Q: Tensor, R: Tensor) -> Tensor:
+    def forward(ctx: Any, F: Tensor, A: Tensor, B: Tensor, Q: Tensor, R: Tensor) -> Tensor:
         M = A - B @ F
         RF = R @ F
         P, S, stable = _lyapunov_pair(M, Q + F.mT @ RF)
@@ -183,7 +184,7 @@ class _StateFeedbackCost(torch.autograd.Function):
         return torch.where(stable, cost, math.inf)
 
     @staticmethod
-    def backward(ctx, grad_cost: Tensor):
+    def backward(ctx: Any, grad_cost: Tensor) -> tuple[Tensor, None, None, None, None]:
         slope, S, stable = ctx.saved_tensors
         scale = torch.where(stable, 2 * grad_cost, math.nan)  # an infinite cost has no gradient
         return scale[..., None, None] * (slope @ S), None, None, None, None

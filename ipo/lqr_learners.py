@@ -14,19 +14,19 @@ import torch
 from torch import Tensor
 
 from ipo.checks import check_choice, check_count, check_number
-from ipo.game import average, best_response_round, new_players, split_players
+from ipo.game import LinearPlayers, play_round
 from ipo.lqr import LQR, expected_cost, spectral_radius, split_domains, training_costs
 from ipo.optimizers import OPTIMIZERS, descend, make_optimizer
 
-METHODS = ("gradient_descent", "overparameterized", "ipo_fixed_phi", "ipo_variable_phi")
+LQR_METHODS = ("gradient_descent", "overparameterized", "ipo_fixed_phi", "ipo_variable_phi")
 
 
 @dataclass(frozen=True)
-class Settings:
+class LQRSettings:
     """How a method is trained. The defaults are the paper's, where it states them.
 
     Attributes:
-        method: one of :data:`METHODS`.
+        method: one of :data:`LQR_METHODS`.
         optimizer: ``adam`` (the published runs), ``plain`` (the paper's text) or ``lbfgs``.
         learning_rate: step size; the paper has 1e-3, and 5e-4 for IPO (Table 5).
         num_iterations: steps of the single player, or rounds of all players.
@@ -48,7 +48,7 @@ class Settings:
     gain_scale: float = 0.001
 
     def __post_init__(self) -> None:
-        check_choice("method", self.method, METHODS)
+        check_choice("method", self.method, LQR_METHODS)
         check_choice("optimizer", self.optimizer, OPTIMIZERS)
         check_number("learning_rate", self.learning_rate, above=0)
         check_count("num_iterations", self.num_iterations, minimum=0)
@@ -60,97 +60,93 @@ class Settings:
         check_number("gain_scale", self.gain_scale, least=0)
 
 
-def published(method: str) -> Settings:
+def published_lqr(method: str) -> LQRSettings:
     """The settings behind Tables 1 and 2; for Phi the reading that comes closest (see the book)."""
-    check_choice("method", method, METHODS)
+    check_choice("method", method, LQR_METHODS)
     if method == "ipo_fixed_phi":
-        return Settings(method, learning_rate=5e-4)
+        return LQRSettings(method, learning_rate=5e-4)
     if method == "ipo_variable_phi":
-        return Settings(method, learning_rate=5e-4, phi_scale=0.03, gain_scale=0.0)
-    return Settings(method)
+        return LQRSettings(method, learning_rate=5e-4, phi_scale=0.03, gain_scale=0.0)
+    return LQRSettings(method)
 
 
 @dataclass(frozen=True)
 class Learner:
-    """``iterate()`` lets everybody move once; ``gain()`` is the controller ``[R, n_u, n_o]``."""
+    """``iterate()`` is one round; ``gain()`` is the controller ``[R, n_u, n_o]`` that acts."""
 
     iterate: Callable[[], None]
     gain: Callable[[], Tensor]
 
 
 def gradient_descent(
-    problem: LQR, settings: Settings, start: Tensor, seeds: Sequence[int]
+    problem: LQR, settings: LQRSettings, start: Tensor, seeds: Sequence[int]
 ) -> Learner:
     """One player that owns all domains: gradient descent on the pooled cost of K."""
-    K = start.clone().requires_grad_()
-    step = _stepper(settings, K)
+    player = _players(settings, start, num_players=1)
     return Learner(
-        iterate=lambda: step(lambda: training_costs(K, problem).mean(1)),
-        gain=lambda: K.detach(),
+        iterate=lambda: player.round([lambda K: training_costs(K, problem).mean(1)]),
+        gain=lambda: player.policy,
     )
 
 
 def overparameterized(
-    problem: LQR, settings: Settings, start: Tensor, seeds: Sequence[int]
+    problem: LQR, settings: LQRSettings, start: Tensor, seeds: Sequence[int]
 ) -> Learner:
-    """The same player with a controller of two layers, ``K = K_2 K_1``."""
+    """The same player with a controller of two layers, ``K = K_2 K_1``, and one optimiser."""
     Phi, K = _random_layers(problem, settings, seeds)
-    step = _stepper(settings, Phi, K)
+    optimizer = _optimizer(settings, [Phi, K])
+
+    def respond(_: int) -> None:
+        descend(
+            optimizer,
+            lambda: training_costs(K @ Phi, problem).mean(1),
+            settings.max_gradient_norm,
+        )
+
     return Learner(
-        iterate=lambda: step(lambda: training_costs(K @ Phi, problem).mean(1)),
+        iterate=lambda: play_round(1, respond),
         gain=lambda: (K @ Phi).detach(),
     )
 
 
-def ipo_fixed_phi(problem: LQR, settings: Settings, start: Tensor, seeds: Sequence[int]) -> Learner:
+def ipo_fixed_phi(
+    problem: LQR, settings: LQRSettings, start: Tensor, seeds: Sequence[int]
+) -> Learner:
     """A player per domain, each with a whole controller; their average acts (Phi = identity)."""
-    play = _Players(problem, settings, start)
+    players = _players(settings, start, problem.num_domains)
     observations = [W.contiguous() for W in problem.W_train.unbind(1)]  # twice as fast
+    costs = [lambda K, W=W: expected_cost(K, problem, W) for W in observations]
     return Learner(
-        iterate=lambda: play.round(observations),
-        gain=lambda: play.policy,
+        iterate=lambda: players.round(costs),
+        gain=lambda: players.policy,
     )
 
 
 def ipo_variable_phi(
-    problem: LQR, settings: Settings, start: Tensor, seeds: Sequence[int]
+    problem: LQR, settings: LQRSettings, start: Tensor, seeds: Sequence[int]
 ) -> Learner:
     """Phi moves on the pooled cost of all domains, then every player on its own, above Phi."""
     Phi, K = _random_layers(problem, settings, seeds)
-    play = _Players(problem, settings, K.detach())
-    step = _stepper(settings, Phi)
+    players = _players(settings, K, problem.num_domains)
+    optimizer = _optimizer(settings, [Phi])
+    features: list[Tensor] = []  # Phi W_d, [R, n_h, n_x] for each domain
 
-    def iterate() -> None:
-        step(lambda: training_costs(play.policy @ Phi, problem).mean(1))
-        features = split_domains(Phi.detach() @ problem.seen, problem.num_domains)
-        play.round(features.unbind(1))
-
-    return Learner(iterate, gain=lambda: play.policy @ Phi.detach())
-
-
-class _Players:
-    """A player per domain, each with an optimiser of its own, and the ``policy`` that acts.
-
-    All players start at ``start``, and so does their average.
-    """
-
-    def __init__(self, problem: LQR, settings: Settings, start: Tensor) -> None:
-        self.problem = problem
-        players = new_players(
-            start.shape[0], problem.num_domains, start.shape[1:], dtype=start.dtype
+    def move_phi() -> None:
+        descend(
+            optimizer,
+            lambda: training_costs(players.policy @ Phi, problem).mean(1),
+            settings.max_gradient_norm,
         )
-        players += start.unsqueeze(1)
-        self.players = split_players(players)
-        self.policy = average(players)
-        self.steps = [_stepper(settings, player) for player in self.players]
+        seen = split_domains(Phi.detach() @ problem.seen, problem.num_domains)
+        features[:] = seen.unbind(1)
 
-    def round(self, features: Sequence[Tensor]) -> None:
-        """Best responses in order; player d's domain shows ``features[d] [R, n_h, n_x]``."""
-
-        def respond(d: int, policy_of_d: Callable[[], Tensor]) -> None:
-            self.steps[d](lambda: expected_cost(policy_of_d(), self.problem, features[d]))
-
-        best_response_round(self.players, self.policy, respond)
+    costs = [
+        lambda K, d=d: expected_cost(K, problem, features[d]) for d in range(problem.num_domains)
+    ]
+    return Learner(
+        iterate=lambda: players.round(costs, move_phi=move_phi),
+        gain=lambda: players.policy @ Phi.detach(),
+    )
 
 
 LEARNERS = {
@@ -161,7 +157,7 @@ LEARNERS = {
 
 def train(
     problem: LQR,
-    settings: Settings,
+    settings: LQRSettings,
     seeds: Sequence[int],
     start: Tensor | None = None,
     checkpoints: Sequence[int] = (),
@@ -186,40 +182,42 @@ def train(
     if len(seeds) != problem.num_runs:
         raise ValueError(f"seeds = {list(seeds)}: must be one for each of {problem.num_runs} runs")
     start = _checked_start(problem, settings, start)
-    learner = LEARNERS[settings.method]
+    make = LEARNERS[settings.method]
     if settings.optimizer == "lbfgs":  # its curvature model would mix the runs: one at a time
         learners = [
-            learner(problem.run(r), settings, start[r : r + 1], [seed])
-            for r, seed in enumerate(seeds)
+            make(problem.run(r), settings, start[r : r + 1], [seed]) for r, seed in enumerate(seeds)
         ]
     else:
-        learners = [learner(problem, settings, start, seeds)]
+        learners = [make(problem, settings, start, seeds)]
     _check_stable("start", torch.cat([learner.gain() for learner in learners]), problem)
 
     wanted = {*checkpoints, settings.num_iterations}
     for iteration in range(settings.num_iterations + 1):
         if iteration in wanted:
-            yield iteration, torch.cat([learner.gain() for learner in learners]).clone()
+            yield iteration, torch.cat([learner.gain() for learner in learners])
         if iteration < settings.num_iterations:
             for learner in learners:
                 learner.iterate()
 
 
-def trained_gain(problem: LQR, settings: Settings, seeds: Sequence[int], **options) -> Tensor:
-    """The last controller ``[R, n_u, n_o]`` of :func:`train`, which takes the same options."""
-    *_, (_, gain) = train(problem, settings, seeds, **options)
-    return gain
+def _players(settings: LQRSettings, start: Tensor, num_players: int) -> LinearPlayers:
+    """All start at the same controller ``[R, n_u, ...]``, and so does their average."""
+    return LinearPlayers(
+        start.unsqueeze(1).expand(-1, num_players, -1, -1),
+        lambda weights: _optimizer(settings, weights),
+        max_gradient_norm=settings.max_gradient_norm,
+    )
 
 
-def _stepper(settings: Settings, *weights: Tensor) -> Callable[[Callable[[], Tensor]], None]:
-    """A function that lowers an objective by one step on ``weights``, with its own optimiser."""
-    optimizer = make_optimizer(
+def _optimizer(settings: LQRSettings, weights: Sequence[Tensor]) -> torch.optim.Optimizer:
+    return make_optimizer(
         settings.optimizer, weights, settings.learning_rate, settings.weight_decay
     )
-    return lambda objective: descend(optimizer, objective, settings.max_gradient_norm)
 
 
-def _random_layers(problem: LQR, settings: Settings, seeds: Sequence[int]) -> tuple[Tensor, Tensor]:
+def _random_layers(
+    problem: LQR, settings: LQRSettings, seeds: Sequence[int]
+) -> tuple[Tensor, Tensor]:
     """Random ``Phi [R, n_h, n_o]`` and controller ``[R, n_u, n_h]``, a stream for each run."""
     num_inputs, num_observations = problem.gain_shape
 
@@ -235,7 +233,7 @@ def _random_layers(problem: LQR, settings: Settings, seeds: Sequence[int]) -> tu
     return Phi, K
 
 
-def _checked_start(problem: LQR, settings: Settings, start: Tensor | None) -> Tensor:
+def _checked_start(problem: LQR, settings: LQRSettings, start: Tensor | None) -> Tensor:
     shape = (problem.num_runs, *problem.gain_shape)
     if start is None:
         return torch.zeros(shape, dtype=problem.A.dtype)

@@ -52,13 +52,13 @@ def descend(
     """
     leaves = [leaf for group in optimizer.param_groups for leaf in group["params"]]
 
-    def closure() -> Tensor:
+    def closure() -> float:
         costs = objective()
         # The runs do not interact: the gradient of their sum holds the gradient of each.
         gradients = torch.autograd.grad(costs.sum(), leaves)
         for leaf, gradient in zip(leaves, gradients, strict=True):
             leaf.grad = _clip(gradient, max_gradient_norm)
-        return costs.detach().sum()
+        return float(costs.detach().sum())
 
     optimizer.step(closure)
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -25,13 +26,13 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from ipo.checks import check_count, check_counts
-from ipo.dense_network import DenseNetwork
-from ipo.distributions import Categorical, Gaussian
-from ipo.networks import Network, Weights
-from ipo.ppo import Settings, train
-from ipo.vector_environments import FromGymnasium
+from ipo.distributions import Categorical, Gaussian, Generators
+from ipo.networks import DenseNetwork, Network, Weights, copied
+from ipo.ppo import PPOSettings, Training
+from ipo.rollouts import FromGymnasium
 
-Domains = Mapping[str, Callable[[], gymnasium.Env]]
+Make = Callable[[], gymnasium.Env]
+Domains = Mapping[str, Make]
 
 PPO_RATE, IPO_RATE = 1e-3, 5e-4  # of the paper
 
@@ -61,7 +62,7 @@ class Policy:
         return self.network.distribution.mode(parameters)[0, 0].numpy()
 
 
-def default_settings(method: str, num_domains: int, **changes) -> Settings:
+def default_settings(method: str, num_domains: int, **changes: Any) -> PPOSettings:
     """Settings that are sensible for classic control; the learning rates are the paper's.
 
     The copies of environments, about thirty, can be split evenly among domains and players by
@@ -75,17 +76,17 @@ def default_settings(method: str, num_domains: int, **changes) -> Settings:
         "normalize_rewards": True,
         "normalize_advantages": "minibatch",
     }
-    return Settings(method, **(sensible | changes))
+    return PPOSettings(method, **(sensible | changes))
 
 
 def train_policy(
     domains: Domains,
     method: str = "ipo",
     seeds: Sequence[int] = (0,),
-    settings: Settings | None = None,
+    settings: PPOSettings | None = None,
     network: Network | None = None,
     label: str | None = None,
-    **changes,
+    **changes: Any,
 ) -> Policy:
     """Train one policy for each seed by ``ppo``, ``ipo`` or ``ensemble``.
 
@@ -94,7 +95,7 @@ def train_policy(
         method: how to train.
         seeds: the runs, which are trained side by side.
         settings: instead of :func:`default_settings` of the method.
-        network: instead of a :class:`ipo.dense_network.DenseNetwork` that fits the spaces.
+        network: instead of a :class:`ipo.networks.DenseNetwork` that fits the spaces.
         label: the method's name in rows; the method itself if none is given.
         changes: of the settings, such as ``num_updates=50``.
 
@@ -111,16 +112,14 @@ def train_policy(
     makers = list(domains.values())
 
     def environments(
-        chosen: list[int], num_copies: list[int], generators: Sequence[np.random.Generator]
+        chosen: list[int], num_copies: list[int], generators: Generators
     ) -> FromGymnasium:
-        of_run = [makers[d] for d, n in zip(chosen, num_copies, strict=True) for _ in range(n)]
-        return _environments(of_run, generators)
+        return _environments([makers[d] for d in np.repeat(chosen, num_copies)], generators)
 
-    training = train(network, network.start, environments, len(makers), settings, list(seeds))
-    steps = tqdm(training, desc=label or method, total=settings.num_updates + 1, unit="update")
-    *_, (_, players) = steps
-    frozen = [{name: w.detach() for name, w in player.items()} for player in players]
-    return Policy(label or method, network, frozen, tuple(seeds))
+    training = Training(network, environments, len(makers), settings, list(seeds))
+    for _ in tqdm(range(settings.num_updates), desc=label or method, unit="update"):
+        training.update()
+    return Policy(label or method, network, copied(training.players), tuple(seeds))
 
 
 def evaluate_policy(
@@ -149,7 +148,7 @@ def compare(
     seeds: Sequence[int] = (0, 1),
     controls: bool = False,
     num_episodes: int = 20,
-    **changes,
+    **changes: Any,
 ) -> pd.DataFrame:
     """PPO and IPO side by side: rows of every method, run and domain.
 
@@ -222,12 +221,10 @@ def check_domains(name: str, domains: Domains, minimum: int = 1) -> tuple[Space,
     return observations, actions
 
 
-def _environments(
-    makers: Sequence[Callable[[], gymnasium.Env]], generators: Sequence[np.random.Generator]
-) -> FromGymnasium:
+def _environments(makers: Sequence[Make], generators: Generators) -> FromGymnasium:
     """One copy of each maker for every run, with resets from the run's generator."""
 
-    def wrapped(make: Callable[[], gymnasium.Env]) -> gymnasium.Env:
+    def wrapped(make: Make) -> gymnasium.Env:
         env = make()
         return ClipAction(env) if isinstance(env.action_space, Box) else env
 
@@ -239,12 +236,7 @@ def _environments(
     return environments
 
 
-def _returns(
-    policy: Policy,
-    make: Callable[[], gymnasium.Env],
-    num_episodes: int,
-    generators: Sequence[np.random.Generator],
-) -> Tensor:
+def _returns(policy: Policy, make: Make, num_episodes: int, generators: Generators) -> Tensor:
     """Return of the first episode of every copy, ``[R, N]``."""
     environments = _environments([make] * num_episodes, generators)
     acting = policy.network.frozen(policy.players)

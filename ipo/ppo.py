@@ -1,9 +1,8 @@
-"""Proximal policy optimisation (PPO) and Invariant Policy Optimization (IPO): one training loop.
+"""Proximal policy optimisation (PPO) and Invariant Policy Optimization (IPO): the game of networks.
 
 Players are trained in turn, each on rollouts of the *average* of all players in the domains that
-it owns, by PPO's clipped objective (Schulman et al., 2017). PPO is the game with one player that
-owns all domains; IPO has a player for each domain (Algorithm 1 of the paper, with fixed Phi); an
-ensemble has as many players as IPO, and each owns all domains.
+it owns, by PPO's clipped objective (Schulman et al., 2017). Who owns what, and the order of moves,
+are those of :mod:`ipo.game`: ``ppo`` is its ``pooled`` game, in which one player owns all domains.
 
 Axes: R runs, E players, N copies of the environments, T steps, F = N T frames.
 """
@@ -20,19 +19,20 @@ import torch
 from torch import Tensor
 
 from ipo.checks import check_choice, check_count, check_counts, check_number
-from ipo.distributions import Distribution
+from ipo.distributions import Distribution, Generators
+from ipo.game import domains_of_players, play_round
 from ipo.networks import Network, OnTable, Weights
-from ipo.rollouts import TIME_OUTS, Environments, RewardNormalizer, Rollout, collect
+from ipo.rollouts import TIME_OUTS, Collector, Environments, Rollout
 
 METHODS = ("ppo", "ipo", "ensemble")
 NORMALIZATIONS = ("none", "minibatch", "rollout")
 
 # (domains, how many copies of each, a generator for each run) -> environments
-MakeEnvironments = Callable[[list[int], list[int], Sequence[np.random.Generator]], Environments]
+MakeEnvironments = Callable[[list[int], list[int], Generators], Environments]
 
 
 @dataclass(frozen=True)
-class Settings:
+class PPOSettings:
     """How a policy is trained. Sizes and rates are those of the paper's coloured keys (Table 6).
 
     Attributes:
@@ -95,24 +95,15 @@ class Settings:
         if self.num_minibatches is not None:
             check_count("num_minibatches", self.num_minibatches)
         for name in ("learning_rate", "adam_epsilon", "clip", "max_gradient_norm", "reward_clip"):
-            check_number(name, getattr(self, name), above=0)
-            if math.isinf(getattr(self, name)):
-                raise ValueError(f"{name} = {getattr(self, name)}: must be finite")
+            check_number(name, getattr(self, name), above=0, below=math.inf)
         for name in ("value_weight", "entropy_weight"):
             check_number(name, getattr(self, name), least=0)
         for name in ("discount", "gae_lambda"):
-            check_number(name, getattr(self, name), least=0)
-            if getattr(self, name) > 1:
-                raise ValueError(f"{name} = {getattr(self, name)}: must be at most 1")
+            check_number(name, getattr(self, name), least=0, most=1)
 
     def domains_of_players(self, num_domains: int) -> list[list[int]]:
-        """The domains that each player owns."""
-        everything = list(range(num_domains))
-        return {
-            "ppo": [everything],
-            "ipo": [[d] for d in everything],
-            "ensemble": [everything] * num_domains,
-        }[self.method]
+        """The domains that each player owns; ``ppo`` is what the game calls ``pooled``."""
+        return domains_of_players("pooled" if self.method == "ppo" else self.method, num_domains)
 
     def copies_of_players(self, num_domains: int) -> list[list[int]]:
         """How many copies each player has of each domain that it owns."""
@@ -147,36 +138,12 @@ class Settings:
             )
         return size
 
-
-def published(method: str, **changes) -> Settings:
-    """The settings of the paper's runs on the coloured keys, with ``changes``."""
-    paper = {
-        "learning_rate": 5e-4 if method == "ipo" else 1e-3,
-        "time_outs": "terminal",
-        "skip_last_frames": True,
-    }
-    return Settings(method, **(paper | changes))
-
-
-def train(
-    network: Network | OnTable,
-    start: Callable[[Sequence[np.random.Generator]], Weights],
-    make_environments: MakeEnvironments,
-    num_domains: int,
-    settings: Settings,
-    seeds: Sequence[int],
-) -> Iterator[tuple[int, list[Weights]]]:
-    """Train one policy for each seed: a :class:`Training` from its start to its end.
-
-    Yields:
-        ``(number of frames seen, weights of every player)`` at the start and after each update.
-        The weights change in place: copy what you want to keep.
-    """
-    training = Training(network, start, make_environments, num_domains, settings, seeds)
-    yield training.num_frames, training.players
-    for _ in range(settings.num_updates):
-        training.update()
-        yield training.num_frames, training.players
+    def collector(self, environments: Environments) -> Collector:
+        """Of a player in its environments."""
+        clip = self.reward_clip if self.normalize_rewards else None
+        return Collector(
+            environments, self.num_steps, self.discount, self.gae_lambda, self.time_outs, clip
+        )
 
 
 class Training:
@@ -184,7 +151,6 @@ class Training:
 
     Args:
         network: one player's outputs; its ``frozen(players)`` is the average that acts.
-        start: random weights ``{name: [R, ...]}`` of a player, from a generator for each run.
         make_environments: ``(domains, num_copies, generators)`` -> so many copies of each domain.
         num_domains: training domains.
         settings: the method and how it is trained.
@@ -192,7 +158,7 @@ class Training:
 
     Attributes:
         players: weights of every player; they change in place.
-        environments: of every player.
+        collectors: every player's environments.
         num_frames: seen so far, in each run.
 
     Raises:
@@ -203,14 +169,12 @@ class Training:
     def __init__(
         self,
         network: Network | OnTable,
-        start: Callable[[Sequence[np.random.Generator]], Weights],
         make_environments: MakeEnvironments,
         num_domains: int,
-        settings: Settings,
+        settings: PPOSettings,
         seeds: Sequence[int],
     ) -> None:
         check_counts("seeds", seeds, minimum=0)
-        check_count("num_domains", num_domains)
         owned = settings.domains_of_players(num_domains)
         copies = settings.copies_of_players(num_domains)
         for own in copies:
@@ -219,47 +183,89 @@ class Training:
         self.draws, self.resets, self.orders = (
             [np.random.default_rng(stream[i]) for stream in streams] for i in range(3)
         )
-        self.network, self.settings = network, settings
-        self.players = [start(self.draws) for _ in owned]
+        self.network, self.settings, self.num_frames = network, settings, 0
+        self.players = [network.start(self.draws) for _ in owned]
         leaves = [[w.requires_grad_() for w in player.values()] for player in self.players]
         self.optimizers = [
             torch.optim.Adam(own, settings.learning_rate, eps=settings.adam_epsilon, fused=True)
             for own in leaves
         ]
-        self.environments = [
+        environments = [
             make_environments(domains, own, self.resets)
             for domains, own in zip(owned, copies, strict=True)
         ]
-        self.observations = [own.reset() for own in self.environments]
-        self.normalizers = [
-            RewardNormalizer(len(seeds), sum(own), settings.discount, settings.reward_clip)
-            if settings.normalize_rewards
-            else None
-            for own in copies
-        ]
-        self.num_frames = 0
+        self.collectors = [settings.collector(own) for own in environments]
 
-    def update(self) -> None:
-        """One round: each player in turn collects with the average of all, and learns."""
-        settings = self.settings
-        for d in range(len(self.players)):
-            rollout, self.observations[d] = collect(
-                self.network.frozen(self.players),
-                self.network.distribution,
-                self.environments[d],
-                self.observations[d],
-                settings.num_steps,
-                self.draws,
-                self.normalizers[d],
-                settings.discount,
-                settings.gae_lambda,
-                settings.time_outs,
-            )
-            frames = rollout.frames()
-            improve(
-                self.network, self.players, d, self.optimizers[d], frames, settings, self.orders
-            )
-            self.num_frames += frames.values[0].numel()
+    def reports(self) -> Iterator[tuple[int, list[Weights]]]:
+        """Train to the end: ``(num_frames, players)`` now and after each update.
+
+        The weights change in place: keep what you need with :func:`ipo.networks.copied`.
+        """
+        yield self.num_frames, self.players
+        for _ in range(self.settings.num_updates):
+            self.update()
+            yield self.num_frames, self.players
+
+    def update(self, only: int | None = None) -> None:
+        """One round of Algorithm 1; or the move of one player, while all else stands still."""
+        if only is None:
+            play_round(len(self.players), self.respond, num_inner_rounds=1, move_phi=None)
+        else:
+            self.respond(only)
+
+    def respond(self, d: int) -> None:
+        """Player d's move: it collects with the average of all players, and learns."""
+        average = self.network.frozen(self.players)
+        rollout = self.collectors[d].collect(average, self.network.distribution, self.draws)
+        self.num_frames += rollout.values[0].numel()
+        self.improve(d, rollout.frames())
+
+    def improve(self, d: int, frames: Rollout) -> None:
+        """Some epochs of PPO for player d on frames ``[R, F]``, while the others stand still.
+
+        The player sees its own outputs only through the average, so they carry the factor 1 / E.
+        """
+        settings, player = self.settings, self.players[d]
+        share = 1 / len(self.players)
+        others = self._others(d, frames.observations)
+        if settings.normalize_advantages == "rollout":
+            frames = frames._replace(advantages=standardize(frames.advantages))
+        runs = torch.arange(len(frames.actions)).unsqueeze(1)
+        for epoch in range(settings.num_epochs):
+            skip = settings.skip_last_frames and epoch % 2 == 1
+            for chosen in minibatches(frames, settings, self.orders, skip):
+                batch = Rollout(*(x[runs, chosen] for x in frames))
+                outputs = self.network(player, batch.observations)
+                if others:
+                    outputs = [
+                        part[runs, chosen] + share * own
+                        for part, own in zip(others, outputs, strict=True)
+                    ]
+                loss = clipped_loss(self.network.distribution, *outputs, batch, settings)
+                self._descend(d, loss)
+
+    def _others(self, d: int, observations: Tensor) -> list[Tensor]:
+        """What the others contribute to the average; nothing where there are none."""
+        others = [player for e, player in enumerate(self.players) if e != d]
+        if not others:
+            return []
+        share = 1 / len(self.players)
+        return [(1 - share) * part for part in self.network.frozen(others)(observations)]
+
+    def _descend(self, d: int, loss: Tensor) -> None:
+        leaves = list(self.players[d].values())
+        gradients = torch.autograd.grad(loss.sum(), leaves)
+        clipped = clip_gradients(gradients, self.settings.max_gradient_norm)
+        for leaf, gradient in zip(leaves, clipped, strict=True):
+            leaf.grad = gradient
+        self.optimizers[d].step()
+
+    @torch.no_grad()
+    def set_players(self, players: Sequence[Weights]) -> None:
+        """Go on from other weights; what the optimisers remember stays."""
+        for own, weights in zip(self.players, players, strict=True):
+            for name, weight in own.items():
+                weight.copy_(weights[name])
 
     def state(self) -> dict[str, Any]:
         """All that changes, as a tree of tensors and plain values; environments must have one.
@@ -269,85 +275,28 @@ class Training:
         return {
             "num_frames": self.num_frames,
             "players": self.players,
-            "optimizers": [
-                list(optimizer.state_dict()["state"].values()) for optimizer in self.optimizers
-            ],
-            "normalizers": [
-                normalizer and {"discounted": normalizer.discounted, "moments": normalizer.moments}
-                for normalizer in self.normalizers
-            ],
-            "generators": [[g.bit_generator.state for g in own] for own in self._generators()],
-            "environments": [own.state() for own in self.environments],
-            "observations": self.observations,
+            "optimizers": [list(own.state_dict()["state"].values()) for own in self.optimizers],
+            "generators": [g.bit_generator.state for g in self._generators()],
+            "collectors": [own.state() for own in self.collectors],
         }
 
     def restore(self, state: dict[str, Any]) -> None:
         self.num_frames = state["num_frames"]
-        with torch.no_grad():
-            for player, weights in zip(self.players, state["players"], strict=True):
-                for name, weight in player.items():
-                    weight.copy_(weights[name])
+        self.set_players(state["players"])
         for optimizer, moments in zip(self.optimizers, state["optimizers"], strict=True):
             groups = optimizer.state_dict()["param_groups"]
             optimizer.load_state_dict({"state": dict(enumerate(moments)), "param_groups": groups})
-        for normalizer, own in zip(self.normalizers, state["normalizers"], strict=True):
-            if normalizer is not None:
-                normalizer.discounted, normalizer.moments = own["discounted"], own["moments"]
-        for generators, states in zip(self._generators(), state["generators"], strict=True):
-            for generator, own in zip(generators, states, strict=True):
-                generator.bit_generator.state = own
-        for environments, own in zip(self.environments, state["environments"], strict=True):
-            environments.restore(own)
-        self.observations = list(state["observations"])
+        for generator, own in zip(self._generators(), state["generators"], strict=True):
+            generator.bit_generator.state = own
+        for collector, own in zip(self.collectors, state["collectors"], strict=True):
+            collector.restore(own)
 
-    def _generators(self) -> tuple[list[np.random.Generator], ...]:
-        return self.draws, self.resets, self.orders
-
-
-def improve(
-    network: Network | OnTable,
-    players: Sequence[Weights],
-    d: int,
-    optimizer: torch.optim.Optimizer,
-    frames: Rollout,
-    settings: Settings,
-    generators: Sequence[np.random.Generator],
-) -> None:
-    """Player d's move: some epochs of PPO on its frames ``[R, F]``, while the others stand still.
-
-    The player sees its own outputs only through the average, so they carry the factor 1 / E.
-    """
-    share = 1 / len(players)
-    others = [player for e, player in enumerate(players) if e != d]
-    if others:
-        parameters, values = network.frozen(others)(frames.observations)
-        others_parameters, others_values = (1 - share) * parameters, (1 - share) * values
-    if settings.normalize_advantages == "rollout":
-        frames = frames._replace(advantages=standardize(frames.advantages))
-    leaves = list(players[d].values())
-    runs = torch.arange(len(frames.actions)).unsqueeze(1)
-    for epoch in range(settings.num_epochs):
-        skip = settings.skip_last_frames and epoch % 2 == 1
-        for chosen in minibatches(frames, settings, generators, skip):
-            batch = Rollout(*(x[runs, chosen] for x in frames))
-            parameters, values = network(players[d], batch.observations)
-            if others:
-                parameters = others_parameters[runs, chosen] + share * parameters
-                values = others_values[runs, chosen] + share * values
-            loss = clipped_loss(network.distribution, parameters, values, batch, settings)
-            gradients = torch.autograd.grad(loss.sum(), leaves)
-            for leaf, gradient in zip(
-                leaves, clip_gradients(gradients, settings.max_gradient_norm), strict=True
-            ):
-                leaf.grad = gradient
-            optimizer.step()
+    def _generators(self) -> list[np.random.Generator]:
+        return [*self.draws, *self.resets, *self.orders]
 
 
 def minibatches(
-    frames: Rollout,
-    settings: Settings,
-    generators: Sequence[np.random.Generator],
-    skip_last_frames: bool,
+    frames: Rollout, settings: PPOSettings, generators: Generators, skip_last_frames: bool
 ) -> Iterator[Tensor]:
     """Indices ``[R, B]`` of frames in an order of each run's own."""
     numbers = np.arange(frames.actions.shape[1])
@@ -362,7 +311,7 @@ def clipped_loss(
     parameters: Tensor,
     values: Tensor,
     batch: Rollout,
-    settings: Settings,
+    settings: PPOSettings,
 ) -> Tensor:
     """PPO's loss ``[R]``, to be minimised, on a minibatch ``[R, B]``.
 

@@ -5,15 +5,16 @@ Axes: R runs, N copies of the environments, T steps.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import NamedTuple, Protocol
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
+from gymnasium.vector import AutoresetMode, VectorEnv
 from torch import Tensor
 
-from ipo.distributions import Distribution
-from ipo.networks import Outputs
+from ipo.distributions import Distribution, Generators
+from ipo.networks import Acting
 
 TIME_OUTS = ("bootstrap", "terminal", "no_advantage")
 
@@ -41,6 +42,54 @@ class Environments(Protocol):
     def reset(self) -> Tensor: ...
 
     def step(self, actions: Tensor) -> Step: ...
+
+
+class FromGymnasium:
+    """``R x N`` copies in one ``gymnasium.vector.VectorEnv``, which begin anew in the same step.
+
+    Args:
+        envs: made with ``autoreset_mode=AutoresetMode.SAME_STEP``; observations are arrays.
+        num_runs: R; copies r N to (r + 1) N belong to run r.
+        seed: of the first reset; each copy has a random stream of its own.
+    """
+
+    def __init__(self, envs: VectorEnv, num_runs: int, seed: int) -> None:
+        mode = envs.metadata["autoreset_mode"]
+        if mode != AutoresetMode.SAME_STEP:
+            raise ValueError(f"envs: have autoreset_mode = {mode}, must have SAME_STEP")
+        if envs.num_envs % num_runs:
+            raise ValueError(f"envs: {envs.num_envs} copies, must be a multiple of {num_runs} runs")
+        self.envs, self.num_runs = envs, num_runs
+        # Gymnasium's own seeds s, s + 1, ... would give neighbouring runs the same streams.
+        streams = np.random.SeedSequence(seed).spawn(envs.num_envs)
+        self.seeds = [int(stream.generate_state(1)[0]) for stream in streams]
+
+    def reset(self) -> Tensor:
+        return self._by_run(self.envs.reset(seed=self.seeds)[0])
+
+    def step(self, actions: Tensor) -> Step:
+        answer = self.envs.step(actions.flatten(0, 1).numpy())
+        observation, reward, terminated, truncated, info = answer
+        last = observation.copy()
+        for copy in np.flatnonzero(terminated | truncated):
+            last[copy] = info["final_obs"][copy]
+        return Step(
+            self._by_run(observation),
+            self._by_run(reward),
+            self._by_run(terminated).bool(),
+            self._by_run(truncated).bool(),
+            self._by_run(last),
+        )
+
+    def state(self) -> dict[str, Any]:
+        """Of environments that have one."""
+        return self.envs.state()
+
+    def restore(self, state: dict[str, Any]) -> None:
+        self.envs.restore(state)
+
+    def _by_run(self, values: np.ndarray) -> Tensor:
+        return torch.tensor(values, dtype=torch.float32).unflatten(0, (self.num_runs, -1))
 
 
 class RewardNormalizer:
@@ -93,91 +142,107 @@ class Rollout(NamedTuple):
         return Rollout(*(x.flatten(1, 2) for x in self))
 
 
-def collect(
-    policy: Callable[[Tensor], Outputs],
-    distribution: type[Distribution],
-    environments: Environments,
-    observation: Tensor,
-    num_steps: int,
-    generators: Sequence[np.random.Generator],
-    normalizer: RewardNormalizer | None,
-    discount: float,
-    gae_lambda: float,
-    time_outs: str,
-) -> tuple[Rollout, Tensor]:
-    """T steps of a policy in all copies; returns the rollout and the observation after it.
+@dataclass
+class Collector:
+    """One player's copies of environments, which go on from rollout to rollout.
 
-    The settings are those of :class:`ipo.ppo.Settings`.
+    Attributes:
+        environments: all begin now.
+        num_steps: T, of each rollout.
+        discount, gae_lambda, time_outs: see :class:`ipo.ppo.PPOSettings`.
+        reward_clip: bound on normalised rewards; ``None``: they are not normalised.
     """
-    steps = []
-    for _ in range(num_steps):
+
+    environments: Environments
+    num_steps: int
+    discount: float
+    gae_lambda: float
+    time_outs: str = "bootstrap"
+    reward_clip: float | None = None
+
+    def __post_init__(self) -> None:
+        self.observation = self.environments.reset()
+        self.normalizer = None
+        if self.reward_clip is not None:
+            num_runs, num_copies = self.observation.shape[:2]
+            self.normalizer = RewardNormalizer(
+                num_runs, num_copies, self.discount, self.reward_clip
+            )
+
+    def collect(
+        self, policy: Acting, distribution: type[Distribution], generators: Generators
+    ) -> Rollout:
+        """T steps of a policy in all copies; each run draws its actions from its generator."""
+        steps = [self._act(policy, distribution, generators) for _ in range(self.num_steps)]
+        observations, parameters, actions, values, rewards, beyond, terminated, truncated = (
+            torch.stack(x, dim=2) for x in zip(*steps, strict=True)
+        )
+        ended = terminated | truncated
+        if self.normalizer is not None:
+            rewards = self.normalizer(rewards, ended)
+        all_values = torch.cat([values, policy(self.observation)[1].unsqueeze(-1)], dim=-1)
+        errors = value_errors(rewards + beyond, all_values, ended, self.discount)
+        if self.time_outs == "no_advantage":  # what these steps were worth is not known
+            errors = errors.masked_fill(truncated, 0.0)
+        gains = advantages(errors, ended, self.discount * self.gae_lambda)
+        log_probabilities = distribution.log_probability(parameters, actions)
+        return Rollout(observations, actions, log_probabilities, values, gains, values + gains)
+
+    def _act(
+        self, policy: Acting, distribution: type[Distribution], generators: Generators
+    ) -> tuple[Tensor, ...]:
+        observation = self.observation
         parameters, values = policy(observation)
         actions = distribution.sample(parameters, generators)
-        step = environments.step(actions)
+        step = self.environments.step(actions)
+        self.observation = step.observation
         beyond = torch.zeros_like(values)
         timed_out = step.truncated & ~step.terminated
-        if time_outs == "bootstrap" and bool(timed_out.any()):
+        if self.time_outs == "bootstrap" and bool(timed_out.any()):
             # The task goes on after a time-out: what it is worth from there is part of the return.
-            beyond = torch.where(timed_out, discount * policy(step.last_observation)[1], beyond)
-        steps.append(
-            (
-                observation,
-                parameters,
-                actions,
-                values,
-                step.reward,
-                beyond,
-                step.terminated,
-                step.truncated,
-            )
-        )
-        observation = step.observation
-    observations, parameters, actions, values, rewards, beyond, terminated, truncated = (
-        torch.stack(x, dim=2) for x in zip(*steps, strict=True)
-    )
-    ended = terminated | truncated
-    if normalizer is not None:
-        rewards = normalizer(rewards, ended)
-    gains = advantages(
-        rewards + beyond,
-        values,
-        torch.cat([values[..., 1:], policy(observation)[1].unsqueeze(-1)], dim=-1),
-        ended,
-        discount,
-        gae_lambda,
-        without=truncated if time_outs == "no_advantage" else None,
-    )
-    log_probabilities = distribution.log_probability(parameters, actions)
-    rollout = Rollout(observations, actions, log_probabilities, values, gains, values + gains)
-    return rollout, observation
+            later = self.discount * policy(step.last_observation)[1]
+            beyond = torch.where(timed_out, later, beyond)
+        ends = step.terminated, step.truncated
+        return observation, parameters, actions, values, step.reward, beyond, *ends
+
+    def state(self) -> dict[str, Any]:
+        """All that changes; the environments must have a state."""
+        scale = self.normalizer and [self.normalizer.discounted, self.normalizer.moments]
+        return {
+            "environments": self.environments.state(),
+            "observation": self.observation,
+            "scale": scale,
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        self.environments.restore(state["environments"])
+        self.observation = state["observation"]
+        if self.normalizer is not None:
+            self.normalizer.discounted, self.normalizer.moments = state["scale"]
 
 
-def advantages(
-    rewards: Tensor,
-    values: Tensor,
-    next_values: Tensor,
-    ended: Tensor,
-    discount: float,
-    gae_lambda: float,
-    without: Tensor | None = None,
-) -> Tensor:
-    """Generalised advantage estimates; all tensors are ``[..., T]``.
+def value_errors(rewards: Tensor, values: Tensor, ended: Tensor, discount: float) -> Tensor:
+    """By how much each of T steps was better than the critic said, ``[..., T]``.
 
-        delta_t = r_t + gamma V(o_(t+1)) - V(o_t)
-        A_t     = delta_t + gamma lambda A_(t+1),      both without their future where t is the end
+        delta_t = r_t + gamma V(o_(t+1)) - V(o_t),      without V(o_(t+1)) where t is the end
 
-    Steps marked in ``without`` get A_t = 0: what they were worth is not known.
-
-    Source: Schulman et al. (2016).
+    ``values [..., T + 1]`` have the one of what is seen after the last step, too.
     """
     goes_on = (~ended).to(values)
-    deltas = rewards + discount * goes_on * next_values - values
-    factors = discount * gae_lambda * goes_on
-    if without is not None:
-        deltas = deltas.masked_fill(without, 0.0)  # these steps end an episode: no future either
-    estimates = torch.empty_like(deltas)
-    estimate = torch.zeros_like(deltas[..., 0])
-    for t in reversed(range(deltas.shape[-1])):
-        estimate = deltas[..., t] + factors[..., t] * estimate
+    return rewards + discount * goes_on * values[..., 1:] - values[..., :-1]
+
+
+def advantages(errors: Tensor, ended: Tensor, decay: float) -> Tensor:
+    """Generalised advantage estimates of :func:`value_errors`; all tensors are ``[..., T]``.
+
+        A_t = delta_t + gamma lambda A_(t+1),      without A_(t+1) where t is the end
+
+    ``decay`` is gamma lambda. Source: Schulman et al. (2016).
+    """
+    factors = decay * (~ended).to(errors)
+    estimates = torch.empty_like(errors)
+    estimate = torch.zeros_like(errors[..., 0])
+    for t in reversed(range(errors.shape[-1])):
+        estimate = errors[..., t] + factors[..., t] * estimate
         estimates[..., t] = estimate
     return estimates

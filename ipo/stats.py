@@ -6,46 +6,27 @@ over runs; with few runs they are a little too narrow.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import scipy.stats
 
-from ipo.checks import check_number
-
 NUM_RESAMPLES = 10_000
 
 
-def iqm(values: Sequence[float], axis: int = -1) -> np.ndarray:
-    """Interquartile mean: the mean of the middle half of the runs."""
-    return scipy.stats.trim_mean(values, 0.25, axis=axis)
-
-
-def bootstrap_interval(
-    values: Sequence[float],
-    rng: np.random.Generator,
-    statistic: Callable = np.mean,
-    level: float = 0.95,
-) -> tuple[float, float]:
-    """Percentile bootstrap interval of a statistic of runs ``[num_runs]``.
-
-    Args:
-        statistic: takes an array and ``axis``, such as ``np.mean`` or :func:`iqm`.
-        level: nominal coverage, between 0 and 1.
+def bootstrap_interval(values: Sequence[float], rng: np.random.Generator) -> tuple[float, float]:
+    """95 % percentile bootstrap interval of the mean of runs ``[num_runs]``.
 
     Raises:
-        ValueError: fewer than two runs, values that are not finite, a level outside (0, 1).
+        ValueError: fewer than two runs, values that are not finite.
     """
-    values = _checked("values", values)
-    check_number("level", level, above=0)
-    if level >= 1:
-        raise ValueError(f"level = {level}: must be below 1")
-    if np.ptp(values) == 0:  # every resample is the same; scipy would warn and return NaN
-        return float(values[0]), float(values[0])
+    runs = _checked("values", values)
+    if np.ptp(runs) == 0:  # every resample is the same; scipy would warn and return NaN
+        return float(runs[0]), float(runs[0])
     interval = scipy.stats.bootstrap(
-        (values,),
-        statistic,
-        confidence_level=level,
+        (runs,),
+        np.mean,
+        confidence_level=0.95,
         n_resamples=NUM_RESAMPLES,
         axis=-1,
         method="percentile",
@@ -58,12 +39,12 @@ def paired_difference(
     values: Sequence[float], baseline: Sequence[float], rng: np.random.Generator
 ) -> tuple[float, float, float]:
     """Mean of ``values - baseline`` run by run, with its 95 % bootstrap interval."""
-    values, baseline = _checked("values", values), _checked("baseline", baseline)
-    if len(values) != len(baseline):
+    runs, others = _checked("values", values), _checked("baseline", baseline)
+    if len(runs) != len(others):
         raise ValueError(
-            f"baseline has {len(baseline)} runs, must have {len(values)}, one for each value"
+            f"baseline has {len(others)} runs, must have {len(runs)}, one for each value"
         )
-    difference = values - baseline
+    difference = runs - others
     return float(difference.mean()), *bootstrap_interval(difference, rng)
 
 
@@ -72,8 +53,8 @@ def probability_of_improvement(costs: Sequence[float], baseline: Sequence[float]
 
     P(X < Y) + P(X = Y) / 2    over all pairs of runs (Mann-Whitney U / (n m))
     """
-    costs, baseline = _checked("costs", costs), _checked("baseline", baseline)
-    return float(np.mean((costs[:, None] < baseline) + 0.5 * (costs[:, None] == baseline)))
+    runs, others = _checked("costs", costs)[:, None], _checked("baseline", baseline)
+    return float(np.mean((runs < others) + 0.5 * (runs == others)))
 
 
 def _checked(name: str, values: Sequence[float]) -> np.ndarray:

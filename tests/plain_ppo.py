@@ -2,7 +2,7 @@
 
 One run at a time, a loop over environments, layers of ``torch.nn``.
 Shares no code with ``ipo``; meant to be checked by reading. PPO is one player; IPO is a player for
-each domain. ``s`` is anything with the attributes of ``ipo.ppo.Settings``.
+each domain. ``s`` is anything with the attributes of ``ipo.ppo.PPOSettings``.
 """
 
 import numpy as np

@@ -11,6 +11,7 @@ import pytest
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
 
 import claims
+import provenance
 import sources
 from build import main
 from execute import load_notebooks, tree_hash
@@ -83,6 +84,7 @@ def in_toy(patch: pytest.MonkeyPatch, root: Path) -> None:
     """The toy's own package, and no claims."""
     patch.setattr(sources, "PACKAGES", {"ipo": root / "ipo"})
     patch.setattr(claims, "write_fragments", lambda folder: None)
+    patch.setattr(provenance, "write_fragment", lambda folder: None)
 
 
 def executed(root: Path, name: str) -> Path:
@@ -109,8 +111,8 @@ def test_second_build_does_nothing(toy, capsys):
     [
         ("environment.txt", "numpy==3\n", {"plain", "painted"}),
         ("data/paper/table.csv", "2\n", {"plain", "painted"}),
-        ("data/results/plain/rows.csv", "2\n", {"plain"}),
-        ("data/results/plain/more.csv", "2\n", {"plain"}),
+        ("data/results/plain/rows.csv", "2\n", {"plain", "painted"}),
+        ("data/results/plain/more.csv", "2\n", {"plain", "painted"}),
         ("notebooks/profiles/class.yml", "plain: {num_runs: 4}\n", {"plain"}),
         ("ipo/colors.py", 'from ipo import shades\n\nRED = "red"\n', {"painted"}),
         ("ipo/shades.py", 'DARK = "light"\n', {"painted"}),

@@ -1,1 +1,8 @@
-"""What the background needs: causal models, predictors that are to be invariant, small games."""
+"""The background: where invariance comes from, and what the game does in principle.
+
+scm              structural causal models: domains are interventions
+predictors       ERM, IRMv1, V-REx and IRM-Games for linear predictors
+icp              invariant causal prediction
+small_games      the game between players with two weights, and its equilibria
+scalar_control   a control problem with two weights
+"""

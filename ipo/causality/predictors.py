@@ -1,4 +1,4 @@
-"""Prediction that is to hold in domains not trained on: ERM, ICP, IRMv1, V-REx and IRM-Games.
+"""Prediction that is to hold in domains not trained on: ERM, IRMv1, V-REx and IRM-Games.
 
 A predictor is linear, ``f(x) = v . x``, with coefficients ``v [R, d]``: R runs are trained at
 once. What a domain makes of it comes from a *task*, which gives
@@ -7,23 +7,20 @@ once. What a domain makes of it comes from a *task*, which gives
     gradients(v) [R, E, d], their derivatives by v,
 
 for E domains. The methods need nothing else, so they are the same for regression and for
-classification. Only ICP looks at samples.
+classification.
 """
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-import numpy as np
-import scipy.stats
 import torch
 from torch import Tensor
 
 from ipo.checks import check_count, check_number
-from ipo.game import average, best_response_round, new_players, split_players
+from ipo.game import Cost, LinearPlayers
 from ipo.optimizers import descend, make_optimizer
 
 
@@ -44,17 +41,17 @@ class Task(Protocol):
 class Regression:
     """Squared error, of which second moments tell everything.
 
-        R_e(v) = v' A_e v - 2 b_e' v + c_e,    A_e = E[x x'], b_e = E[x y], c_e = E[y^2]
+        R_e(v) = v' E[x x'] v - 2 v' E[x y] + E[y^2]
 
     Attributes:
-        A: ``[R, E, d, d]``.
-        b: ``[R, E, d]``.
-        c: ``[R, E]``.
+        gram: ``E[x x'] [R, E, d, d]``.
+        moment: ``E[x y] [R, E, d]``.
+        power: ``E[y^2] [R, E]``.
     """
 
-    A: Tensor
-    b: Tensor
-    c: Tensor
+    gram: Tensor
+    moment: Tensor
+    power: Tensor
 
     @classmethod
     def from_samples(cls, features: Sequence[Tensor], targets: Sequence[Tensor]) -> Regression:
@@ -62,28 +59,67 @@ class Regression:
         check_domains(features, targets)
         pairs = list(zip(features, targets, strict=True))
         return cls(
-            A=torch.stack([x.mT @ x / x.shape[1] for x, _ in pairs], 1),
-            b=torch.stack([(x * y.unsqueeze(-1)).mean(1) for x, y in pairs], 1),
-            c=torch.stack([y.square().mean(1) for _, y in pairs], 1),
+            gram=torch.stack([x.mT @ x / x.shape[1] for x, _ in pairs], 1),
+            moment=torch.stack([(x * y.unsqueeze(-1)).mean(1) for x, y in pairs], 1),
+            power=torch.stack([y.square().mean(1) for _, y in pairs], 1),
         )
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        return tuple(self.b.shape)
+        num_runs, num_domains, dim = self.moment.shape
+        return num_runs, num_domains, dim
 
     @property
     def dtype(self) -> torch.dtype:
-        return self.b.dtype
+        return self.moment.dtype
 
     def risks(self, v: Tensor) -> Tensor:
         v = v.unsqueeze(1)
-        return ((self.A @ v.unsqueeze(-1)).squeeze(-1) * v - 2 * self.b * v).sum(-1) + self.c
+        image = (self.gram @ v.unsqueeze(-1)).squeeze(-1)
+        return (image * v - 2 * self.moment * v).sum(-1) + self.power
 
     def gradients(self, v: Tensor) -> Tensor:
-        return 2 * ((self.A @ v[:, None, :, None]).squeeze(-1) - self.b)
+        return 2 * ((self.gram @ v[:, None, :, None]).squeeze(-1) - self.moment)
 
     def domain(self, e: int) -> Regression:
-        return Regression(self.A[:, e : e + 1], self.b[:, e : e + 1], self.c[:, e : e + 1])
+        return Regression(*(part[:, e : e + 1] for part in (self.gram, self.moment, self.power)))
+
+    @property
+    def costs(self) -> list[Cost]:
+        """The risk ``[R]`` of every domain as a function of its own."""
+
+        def cost_in(gram: Tensor, moment: Tensor, power: Tensor) -> Cost:
+            def cost(v: Tensor) -> Tensor:
+                quadratic = torch.einsum("rp,rpq,rq->r", v, gram, v)
+                return power - 2 * (v * moment).sum(-1) + quadratic
+
+            return cost
+
+        domains = zip(self.gram.unbind(1), self.moment.unbind(1), self.power.unbind(1), strict=True)
+        return [cost_in(*domain) for domain in domains]
+
+    @property
+    def optima(self) -> Tensor:
+        """Each domain's own least squares ``[R, E, d]``."""
+        return torch.linalg.solve(self.gram, self.moment)
+
+    def pooled(self, shares: Sequence[float] | None = None) -> Tensor:
+        """Least squares on the data of all domains ``[R, d]``, with each one's share of the data.
+
+        Shares are equal if none are given.
+
+        Raises:
+            ValueError: not one share for each domain, a share that is not positive.
+        """
+        num = self.shape[1]
+        shares = [1.0] * num if shares is None else list(shares)
+        if len(shares) != num:
+            raise ValueError(f"shares = {shares}: must be {num} numbers, one for each domain")
+        for e, share in enumerate(shares):
+            check_number(f"shares[{e}]", share, above=0)
+        weights = torch.tensor(shares, dtype=self.dtype)
+        gram = torch.einsum("e,repq->rpq", weights, self.gram)
+        return torch.linalg.solve(gram, torch.einsum("e,rep->rp", weights, self.moment))
 
 
 @dataclass(frozen=True)
@@ -132,7 +168,7 @@ class Classification:
 
 
 @dataclass(frozen=True)
-class Settings:
+class PredictorSettings:
     """How a method is trained, with Adam on all samples at once.
 
     Attributes:
@@ -164,7 +200,7 @@ class Settings:
 # ------------------------------------------------------------------- risk with a penalty
 
 
-def erm(task: Task, settings: Settings) -> Tensor:
+def erm(task: Task, settings: PredictorSettings) -> Tensor:
     """Empirical risk minimisation: the predictor that is best on all data together.
 
     min_v  (1 / E) sum_e R_e(v)
@@ -173,7 +209,7 @@ def erm(task: Task, settings: Settings) -> Tensor:
     return _minimize(lambda: _objective(task, settings, v).mean(1), v, settings)
 
 
-def irmv1(task: Task, settings: Settings) -> Tensor:
+def irmv1(task: Task, settings: PredictorSettings) -> Tensor:
     """Invariant risk minimisation, first version, for ``v = Phi w`` with w fixed at ones.
 
         min_Phi  (1 / E) sum_e [ R_e(Phi 1) + penalty * |d/dw R_e(Phi w) at w = 1|^2 / k ]
@@ -184,14 +220,14 @@ def irmv1(task: Task, settings: Settings) -> Tensor:
     Source: Arjovsky et al. (2019), equation (IRMv1).
     """
     Phi = _start(task, settings)
-
-    def objective() -> Tensor:
-        v = Phi.sum(-1)
-        risks = _objective(task, settings, v)
-        return (risks + settings.penalty * irm_penalties(task, Phi)).mean(1)
-
-    _minimize(objective, Phi, settings)
+    _minimize(lambda: irm_objective(task, settings, Phi), Phi, settings)
     return Phi.detach().sum(-1)
+
+
+def irm_objective(task: Task, settings: PredictorSettings, Phi: Tensor) -> Tensor:
+    """What :func:`irmv1` minimises, ``[R]``, for ``Phi [R, d, k]``."""
+    risks = _objective(task, settings, Phi.sum(-1))
+    return (risks + settings.penalty * irm_penalties(task, Phi)).mean(1)
 
 
 def irm_penalties(task: Task, Phi: Tensor) -> Tensor:
@@ -199,7 +235,7 @@ def irm_penalties(task: Task, Phi: Tensor) -> Tensor:
     return (task.gradients(Phi.sum(-1)) @ Phi).square().mean(-1)
 
 
-def vrex(task: Task, settings: Settings) -> Tensor:
+def vrex(task: Task, settings: PredictorSettings) -> Tensor:
     """Risk extrapolation: the risks are to be low, and equal.
 
         min_v  (1 / E) sum_e R_e(v) + penalty * Var_e R_e(v)
@@ -218,20 +254,21 @@ def vrex(task: Task, settings: Settings) -> Tensor:
 # ----------------------------------------------------------------------------- the game
 
 
-def irm_game_fixed_phi(task: Task, settings: Settings) -> Tensor:
+def irm_game_fixed_phi(task: Task, settings: PredictorSettings) -> Tensor:
     """IRM-Games with Phi = identity: a predictor for each domain, and their average acts.
 
         player e:  min_{v_e}  R_e((1 / E) sum_e v_e)
 
     Source: Ahuja et al. (2020), F-IRM; the bound is the one of Ahuja et al. (2021).
     """
-    play = _Players(task, settings)
+    players = _players(task, settings, dim=task.shape[2])
+    costs = _domain_costs(task, settings)
     for _ in range(settings.num_iterations):
-        play.round(lambda w: w)
-    return play.policy.detach()
+        players.round(costs)
+    return players.policy
 
 
-def irm_game_variable_phi(task: Task, settings: Settings) -> Tensor:
+def irm_game_variable_phi(task: Task, settings: PredictorSettings) -> Tensor:
     """The same above a shared ``Phi [R, d, k]``, which moves first, on the pooled risk.
 
         Phi:       min_Phi    (1 / E) sum_e R_e(Phi w_av)
@@ -240,53 +277,47 @@ def irm_game_variable_phi(task: Task, settings: Settings) -> Tensor:
     Source: Ahuja et al. (2020), V-IRM.
     """
     Phi = _start(task, settings)
-    play = _Players(task, settings)
+    players = _players(task, settings, dim=settings.num_features)
     optimizer = make_optimizer("adam", [Phi], settings.learning_rate)
 
     def predictor(w: Tensor, Phi: Tensor) -> Tensor:
         return (Phi @ w.unsqueeze(-1)).squeeze(-1)
 
-    for _ in range(settings.num_iterations):
+    def move_phi() -> None:
         descend(
-            optimizer,
-            lambda: _objective(task, settings, predictor(play.policy, Phi)).mean(1),
+            optimizer, lambda: _objective(task, settings, predictor(players.policy, Phi)).mean(1)
         )
-        play.round(lambda w: predictor(w, Phi.detach()))
-    return predictor(play.policy, Phi).detach()
+
+    def above_phi(cost: Cost) -> Cost:
+        return lambda w: cost(predictor(w, Phi.detach()))
+
+    costs = [above_phi(cost) for cost in _domain_costs(task, settings)]
+    for _ in range(settings.num_iterations):
+        players.round(costs, move_phi=move_phi)
+    return predictor(players.policy, Phi).detach()
 
 
-class _Players:
+def _players(task: Task, settings: PredictorSettings, dim: int) -> LinearPlayers:
     """A player for each domain, all starting at zero, each with an Adam of its own."""
-
-    def __init__(self, task: Task, settings: Settings) -> None:
-        num_runs, num_domains, dim = task.shape
-        check_count("number of domains", num_domains, minimum=2)
-        size = dim if settings.num_features == 1 else settings.num_features
-        self.settings = settings
-        self.domains = [task.domain(e) for e in range(num_domains)]
-        weights = new_players(num_runs, num_domains, [size], dtype=task.dtype)
-        self.players, self.policy = split_players(weights), average(weights)
-        self.optimizers = [
-            make_optimizer("adam", [player], settings.learning_rate) for player in self.players
-        ]
-
-    def round(self, predictor: Callable[[Tensor], Tensor]) -> None:
-        """Every player moves once; ``predictor`` makes coefficients of the average."""
-
-        def respond(e: int, policy_of_e: Callable[[], Tensor]) -> None:
-            descend(
-                self.optimizers[e],
-                lambda: _objective(
-                    self.domains[e], self.settings, predictor(policy_of_e())
-                ).squeeze(1),
-            )
-            if self.settings.bound is not None:
-                self.players[e].data.clamp_(-self.settings.bound, self.settings.bound)
-
-        best_response_round(self.players, self.policy, respond)
+    num_runs, num_domains, _ = task.shape
+    check_count("number of domains", num_domains, minimum=2)
+    return LinearPlayers(
+        torch.zeros(num_runs, num_domains, dim, dtype=task.dtype),
+        lambda weights: make_optimizer("adam", weights, settings.learning_rate),
+        settings.bound,
+    )
 
 
-def _objective(task: Task, settings: Settings, v: Tensor) -> Tensor:
+def _domain_costs(task: Task, settings: PredictorSettings) -> list[Cost]:
+    """What each domain's player wants low: ``cost(v) [R]``."""
+
+    def cost_in(domain: Task) -> Cost:
+        return lambda v: _objective(domain, settings, v).squeeze(1)
+
+    return [cost_in(task.domain(e)) for e in range(task.shape[1])]
+
+
+def _objective(task: Task, settings: PredictorSettings, v: Tensor) -> Tensor:
     return task.risks(v) + settings.ridge * v.square().sum(-1, keepdim=True)
 
 
@@ -295,7 +326,7 @@ def _zeros(task: Task) -> Tensor:
     return torch.zeros(num_runs, dim, dtype=task.dtype, requires_grad=True)
 
 
-def _start(task: Task, settings: Settings) -> Tensor:
+def _start(task: Task, settings: PredictorSettings) -> Tensor:
     """``Phi [R, d, k]``: the identity, or for k = 1 the predictor that ERM ends with."""
     num_runs, _, dim = task.shape
     if settings.num_features == 1:
@@ -304,7 +335,9 @@ def _start(task: Task, settings: Settings) -> Tensor:
     return Phi.repeat(num_runs, 1, 1).requires_grad_()
 
 
-def _minimize(objective: Callable[[], Tensor], weights: Tensor, settings: Settings) -> Tensor:
+def _minimize(
+    objective: Callable[[], Tensor], weights: Tensor, settings: PredictorSettings
+) -> Tensor:
     """Adam on ``objective() -> [R]``; its learning rate falls to zero, so that it settles.
 
     Dividing by the penalty's weight changes nothing but how close Adam's small constant is.
@@ -317,108 +350,10 @@ def _minimize(objective: Callable[[], Tensor], weights: Tensor, settings: Settin
     return weights.detach()
 
 
-METHODS = {
+PREDICTOR_METHODS = {
     method.__name__: method
     for method in (erm, irmv1, vrex, irm_game_fixed_phi, irm_game_variable_phi)
 }
-
-
-# ---------------------------------------------------------------- invariant causal prediction
-
-
-@dataclass(frozen=True)
-class ICPResult:
-    """What invariant causal prediction finds.
-
-    Attributes:
-        p_values: of the hypothesis that a set of features is invariant, by set.
-        accepted: the sets that were not rejected.
-        estimate: features in all of them; ``None`` where none was accepted: the model is wrong.
-        coefficients: ``[d]``, pooled least squares on the estimate, zero elsewhere.
-    """
-
-    p_values: dict[tuple[int, ...], float]
-    accepted: list[tuple[int, ...]]
-    estimate: tuple[int, ...] | None
-    coefficients: np.ndarray
-
-
-def icp(features: Sequence[Tensor], targets: Sequence[Tensor], alpha: float = 0.05) -> ICPResult:
-    """Invariant causal prediction for one run: ``[N_e, d]`` and ``[N_e]`` for every domain.
-
-    A set S is accepted if the residuals of one pooled regression on S have the same mean and
-    variance in all domains, by a t-test and an F-test of each domain against the others, with
-    Bonferroni's correction for the 2 (E - 1) of them. The causes are in every accepted set, with
-    probability at least 1 - alpha, so the estimate is
-
-        S = intersection of all S that are accepted at level alpha.
-
-    Source: Peters, Bühlmann and Meinshausen (2016), Section 3.1.2.
-
-    Raises:
-        ValueError: see :func:`check_domains`; also for a level outside (0, 1), for a single
-            domain, and for a feature that is constant in all of them.
-    """
-    check_number("alpha", alpha, above=0)
-    if alpha >= 1:
-        raise ValueError(f"alpha = {alpha}: must be below 1")
-    check_domains([x.unsqueeze(0) for x in features], [y.unsqueeze(0) for y in targets])
-    check_count("number of domains", len(features), minimum=2)
-    dim = features[0].shape[1]
-    pooled = torch.cat(list(features))
-    for j in range(dim):
-        if bool((pooled[:, j] == pooled[0, j]).all()):
-            raise ValueError(f"feature {j} = {float(pooled[0, j])}: must not be constant")
-
-    # Columns: the features, the target, and ones; their products tell all that is needed.
-    tables = [
-        torch.column_stack([x, y, torch.ones_like(y)]).double().numpy()
-        for x, y in zip(features, targets, strict=True)
-    ]
-    products = np.stack([table.T @ table for table in tables])
-    sets = [S for size in range(dim + 1) for S in itertools.combinations(range(dim), size)]
-    fits = np.stack([_pooled_fit(products.sum(0), S) for S in sets])  # [sets, d + 2]
-    p_values = _same_mean_and_variance(fits, products)
-    accepted = [S for S, p in zip(sets, p_values, strict=True) if p > alpha]
-    estimate = tuple(sorted(set.intersection(*map(set, accepted)))) if accepted else None
-    coefficients = -_pooled_fit(products.sum(0), estimate)[:dim] if estimate else np.zeros(dim)
-    return ICPResult(
-        dict(zip(sets, map(float, p_values), strict=True)), accepted, estimate, coefficients
-    )
-
-
-def _pooled_fit(product: np.ndarray, chosen: tuple[int, ...]) -> np.ndarray:
-    """``r [d + 2]`` such that ``table @ r`` are the residuals of a regression on ``chosen``."""
-    target = len(product) - 2
-    columns = [*chosen, target + 1]
-    fit = np.zeros(len(product))
-    fit[columns] = -np.linalg.solve(product[np.ix_(columns, columns)], product[columns, target])
-    fit[target] = 1
-    return fit
-
-
-def _same_mean_and_variance(fits: np.ndarray, products: np.ndarray) -> np.ndarray:
-    """p-value of each fit: smallest of all tests of a domain against the others, corrected."""
-    ones = products[:, -1, -1]  # samples of each domain
-    sums = fits @ products[:, -1].T  # [sets, E]
-    squares = np.einsum("si,eij,sj->se", fits, products, fits)
-
-    def mean_and_variance(n, total, square):
-        return n, total / n, (square - total**2 / n) / (n - 1)
-
-    n, mean, variance = mean_and_variance(ones, sums, squares)
-    m, others_mean, others_variance = mean_and_variance(
-        ones.sum() - ones,
-        sums.sum(1, keepdims=True) - sums,
-        squares.sum(1, keepdims=True) - squares,
-    )
-    same_mean = scipy.stats.ttest_ind_from_stats(
-        mean, np.sqrt(variance), n, others_mean, np.sqrt(others_variance), m, equal_var=False
-    ).pvalue
-    ratio = scipy.stats.f(n - 1, m - 1)
-    below, above = ratio.cdf(variance / others_variance), ratio.sf(variance / others_variance)
-    smallest = np.minimum(same_mean, 2 * np.minimum(below, above)).min(1)
-    return np.minimum(1, 2 * (len(products) - 1) * smallest)
 
 
 def check_domains(features: Sequence[Tensor], targets: Sequence[Tensor]) -> None:

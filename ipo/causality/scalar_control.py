@@ -15,7 +15,7 @@ import torch
 from scipy.optimize import minimize_scalar
 from torch import Tensor
 
-from ipo.causality.vector_game import Cost
+from ipo.game import Cost
 
 DECAY = 0.99
 NOISE_1, NOISE_2 = 1.0, 0.1
@@ -63,7 +63,11 @@ def costs(betas: Tensor) -> list[Cost]:
         raise ValueError(f"betas: has shape {tuple(betas.shape)}, must be [problems, domains]")
     if not bool(torch.isfinite(betas).all()):
         raise ValueError("betas: holds NaN or infinite coefficients, must be finite")
-    return [lambda k, beta=beta: training_cost(k, beta) for beta in betas.unbind(1)]
+
+    def cost_at(beta: Tensor) -> Cost:
+        return lambda gains: training_cost(gains, beta)
+
+    return [cost_at(beta) for beta in betas.unbind(1)]
 
 
 def unseen_cost(gains: Tensor, betas: Tensor) -> Tensor:
@@ -77,5 +81,5 @@ def invariant_gains() -> Tensor:
     def cost(k_1: float) -> float:
         return float(stationary_cost(torch.tensor([k_1, 0.0]).double(), torch.tensor(0.0)))
 
-    found = minimize_scalar(cost, bounds=(0.0, 1.9), method="bounded", options={"xatol": 1e-12})
-    return torch.tensor([found.x, 0.0], dtype=torch.float64)
+    best = minimize_scalar(cost, bounds=(0.0, 1.9), method="bounded", options={"xatol": 1e-12})
+    return torch.tensor([best.x, 0.0], dtype=torch.float64)

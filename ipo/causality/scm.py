@@ -14,7 +14,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from graphlib import CycleError, TopologicalSorter
-from typing import Protocol
 
 import numpy as np
 import pandas as pd
@@ -43,17 +42,6 @@ class Normal:
 def uniform(rng: np.random.Generator, size: int) -> np.ndarray:
     """Noise that is uniform on [0, 1); a threshold makes any binary variable of it."""
     return rng.random(size)
-
-
-class Assignment(Protocol):
-    """How a variable comes about: from its parents' values and a noise of its own."""
-
-    noise: Noise
-
-    @property
-    def parents(self) -> tuple[str, ...]: ...
-
-    def __call__(self, values: Mapping[str, np.ndarray], noise: np.ndarray) -> np.ndarray: ...
 
 
 @dataclass(frozen=True)
@@ -90,6 +78,9 @@ class Mechanism:
 def bernoulli(parents: Sequence[str], probability: Callable[..., np.ndarray]) -> Mechanism:
     """A binary variable that is 1 with ``probability(*parents)``."""
     return Mechanism(tuple(parents), lambda *pa: (pa[-1] < probability(*pa[:-1])) * 1.0, uniform)
+
+
+Assignment = Linear | Mechanism  # how a variable comes about: of its parents and a noise of its own
 
 
 class SCM:
@@ -130,11 +121,11 @@ class SCM:
     def descendants(self, name: str) -> set[str]:
         """All variables that an intervention on ``name`` can change, itself aside."""
         check_choice("variable", name, self.assignments)
-        found = {name}
+        affected = {name}
         for other in self.order:
-            if found & set(self.parents(other)):
-                found.add(other)
-        return found - {name}
+            if affected & set(self.parents(other)):
+                affected.add(other)
+        return affected - {name}
 
     def sample(self, num_samples: int, rng: np.random.Generator) -> pd.DataFrame:
         """Independent samples, a column for each variable.
@@ -168,7 +159,7 @@ class SCM:
         """The model in which variables are set to values, whatever their causes say."""
         return self.intervene(**{name: Linear({}, Normal(v, 0.0)) for name, v in values.items()})
 
-    def with_noise(self, **noises: Noise) -> SCM:
+    def with_noise(self, **noises: Normal) -> SCM:
         """The model in which variables keep their function and get other noise."""
         for name in noises:
             check_choice("intervention on", name, self.assignments)
@@ -187,6 +178,7 @@ def moments(model: SCM) -> tuple[pd.Series, pd.DataFrame]:
     """
     names = list(model.assignments)
     B = pd.DataFrame(0.0, names, names)
+    noises = []
     for name, assignment in model.assignments.items():
         if not isinstance(assignment, Linear):
             raise TypeError(
@@ -194,7 +186,7 @@ def moments(model: SCM) -> tuple[pd.Series, pd.DataFrame]:
             )
         for parent, coefficient in assignment.coefficients.items():
             B.loc[name, parent] = coefficient
-    noises = [model.assignments[name].noise for name in names]
+        noises.append(assignment.noise)
     mixing = np.linalg.inv(np.eye(len(names)) - B.to_numpy())
     mean = mixing @ [noise.mean for noise in noises]
     covariance = mixing @ np.diag([noise.std**2 for noise in noises]) @ mixing.T

@@ -6,7 +6,10 @@ colour as an argument; grid, rules, view, reward and horizon are MiniGrid's.
 
 from __future__ import annotations
 
+from typing import Any
+
 from minigrid.core.constants import COLOR_TO_IDX
+from minigrid.core.world_object import Door
 from minigrid.envs.doorkey import DoorKeyEnv
 
 from ipo.checks import check_choice, check_count
@@ -34,7 +37,7 @@ class ColoredKeysEnv(DoorKeyEnv):
     """
 
     def __init__(
-        self, size: int = 5, color: str = "grey", max_steps: int | None = None, **kwargs
+        self, size: int = 5, color: str = "grey", max_steps: int | None = None, **kwargs: Any
     ) -> None:
         check_count("size", size, minimum=SMALLEST)
         check_choice("color", color, COLORS)
@@ -52,7 +55,5 @@ class ColoredKeysEnv(DoorKeyEnv):
     @property
     def progress(self) -> int:
         """1 with the key in hand, 2 once the door is unlocked, 0 before."""
-        doors = [thing for thing in self.grid.grid if thing is not None and thing.type == "door"]
-        if not doors[0].is_locked:
-            return 2
-        return int(self.carrying is not None)
+        (door,) = (thing for thing in self.grid.grid if isinstance(thing, Door))
+        return int(self.carrying is not None) if door.is_locked else 2

@@ -10,9 +10,9 @@ The state is that of 7 joints: the wrist's x, y, z, its angles about z, y and x,
 
 from __future__ import annotations
 
-import importlib
+from collections.abc import Callable
 from dataclasses import dataclass, fields
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Protocol
 
 import gymnasium as gym
 import mujoco
@@ -234,10 +234,10 @@ def _add_wrist(spec: mujoco.MjSpec, params: DoorParams) -> None:
 
     capsule = mujoco.mjtGeom.mjGEOM_CAPSULE
     for number, (start, end) in enumerate(TUBES):
-        axis = [*(FINGER + start), *(FINGER + end)]
-        add(f"hook_{number}", type=capsule, size=[TUBE_RADIUS, 0, 0], fromto=axis)
-    axis = [-0.045, 0.0005, 0, -0.017, 0.0005, 0]
-    add("wrist_back", type=capsule, size=[0.0475, 0, 0], fromto=axis)
+        ends = [*(FINGER + start), *(FINGER + end)]
+        add(f"hook_{number}", type=capsule, size=[TUBE_RADIUS, 0, 0], fromto=ends)
+    ends = [-0.045, 0.0005, 0, -0.017, 0.0005, 0]
+    add("wrist_back", type=capsule, size=[0.0475, 0, 0], fromto=ends)
     add(
         "wrist_front",
         type=mujoco.mjtGeom.mjGEOM_BOX,
@@ -385,6 +385,15 @@ def shift_handle(model: mujoco.MjModel, params: DoorParams, handle_shift: np.nda
 # --------------------------------------------------------------------------------- environment
 
 
+class Picture(Protocol):
+    """What draws a door; how it looks is no business of the simulation."""
+
+    def frame(self, qpos: np.ndarray, handle_shift: np.ndarray) -> np.ndarray:
+        """A picture ``[height, width, 3]`` of the joints ``[7]``."""
+
+    def close(self) -> None: ...
+
+
 class DoorEnv(gym.Env):
     """One door, which stays the same until ``reset`` is given a seed. ``ipo/Door-v0``.
 
@@ -401,13 +410,15 @@ class DoorEnv(gym.Env):
         max_steps: T.
         timestep: in s; an action lasts for 0.02 s, whatever it is.
         render_mode: ``rgb_array`` or none.
+        draw: from a door to what makes its pictures; ``rgb_array`` needs it.
 
     Raises:
         TypeError, ValueError: a friction, a door or a horizon that makes no sense, friction and
-            ``params`` together, actions that are not finite, a simulation that diverges.
+            ``params`` together, ``rgb_array`` without ``draw``, actions that are not finite.
+        FloatingPointError: a simulation that diverges.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 50}
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 50}  # noqa: RUF012  (as gymnasium)
 
     def __init__(
         self,
@@ -416,32 +427,39 @@ class DoorEnv(gym.Env):
         max_steps: int = MAX_STEPS,
         timestep: float = TIMESTEP,
         render_mode: str | None = None,
+        draw: Callable[[DoorParams], Picture] | None = None,
     ) -> None:
         if friction is not None and params is not None:
             raise ValueError(f"friction = {friction!r}: must not be given beside params")
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode = {render_mode!r}: must be 'rgb_array' or None")
+        if render_mode is not None and draw is None:
+            raise ValueError(f"render_mode = {render_mode!r}: must come with draw")
         check_count("max_steps", max_steps)
         self.friction = DoorParams(friction=0.0 if friction is None else friction).friction
-        self.given, self.max_steps, self.render_mode = params, max_steps, render_mode
+        self.given, self.max_steps = params, max_steps
+        self.render_mode, self.draw = render_mode, draw
         self.timestep, self.num_substeps = timestep, substeps(timestep)
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, (15,), np.float64)
         self.action_space = gym.spaces.Box(-1.0, 1.0, (6,), np.float32)
         self.params: DoorParams | None = None
-        self.step_count = max_steps
-        self._picture = None
+        self.step_count = 0
+        self._picture: Picture | None = None
 
     def reset(
-        self, *, seed: int | None = None, options: dict | None = None
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
         super().reset(seed=seed)
-        if self.params is None or (seed is not None and self.given is None):
-            self.params = self.given or DoorParams.sample(self.np_random, self.friction)
-            self.model = build_door(self.params, self.timestep).compile()
+        params = self.params
+        if params is None or (seed is not None and self.given is None):
+            params = self.given or DoorParams.sample(self.np_random, self.friction)
+            self.params = params
+            self.model = build_door(params, self.timestep).compile()
             self.data = mujoco.MjData(self.model)
             self.close()
         qpos, self.handle_shift = draw_start(self.np_random)
-        shift_handle(self.model, self.params, self.handle_shift)
+        shift_handle(self.model, params, self.handle_shift)
+        self.hinge, self.arm = lever(params, self.handle_shift)
         mujoco.mj_resetData(self.model, self.data)
         self.data.qpos[:] = qpos
         self.step_count, self.opened = 0, False
@@ -464,13 +482,13 @@ class DoorEnv(gym.Env):
         return observation, float(earned), False, truncated, self._info()
 
     def render(self) -> np.ndarray | None:
-        """A picture of the present state; needs EGL, see :mod:`experiments.pictures`."""
-        if self.render_mode is None:
+        """A picture of the present state; none without a ``render_mode``."""
+        if self.draw is None or self.render_mode is None:
             return None
+        if self.params is None:
+            raise gym.error.ResetNeeded("reset() must come before render()")
         if self._picture is None:
-            # By name: how a door looks is no part of what results depend on.
-            render = importlib.import_module("experiments.pictures")
-            self._picture = render.DoorPicture(self.params)
+            self._picture = self.draw(self.params)
         return self._picture.frame(self.data.qpos, self.handle_shift)
 
     def close(self) -> None:
@@ -478,9 +496,8 @@ class DoorEnv(gym.Env):
             self._picture.close()
             self._picture = None
 
-    def _observe(self) -> tuple[np.ndarray, float]:
-        hinge, arm = lever(self.params, self.handle_shift)
-        return observe(self.data.qpos, self.data.qvel, hinge, arm)
+    def _observe(self) -> tuple[np.ndarray, np.ndarray]:
+        return observe(self.data.qpos, self.data.qvel, self.hinge, self.arm)
 
     def _info(self) -> dict[str, Any]:
         return {"door_angle": float(self.data.qpos[6]), "opened": bool(self.opened)}
@@ -498,7 +515,7 @@ def substeps(timestep: float) -> int:
     return number
 
 
-def check_actions(actions: np.ndarray, step: int, first_door: int = 0) -> None:
+def check_actions(actions: np.ndarray, step: int) -> None:
     """Refuse actions ``[N, 6]`` that are not finite."""
     if actions.shape[1:] != (6,):
         raise ValueError(f"action has shape {actions.shape[1:]}, must be (6,)")
@@ -506,17 +523,16 @@ def check_actions(actions: np.ndarray, step: int, first_door: int = 0) -> None:
     if not finite.all():
         door = int(np.flatnonzero(~finite)[0])
         raise ValueError(
-            f"action = {actions[door].tolist()} of door {first_door + door} in step {step}: "
-            "must be finite"
+            f"action = {actions[door].tolist()} of door {door} in step {step}: must be finite"
         )
 
 
-def check_states(qpos: np.ndarray, qvel: np.ndarray, step: int, first_door: int = 0) -> None:
+def check_states(qpos: np.ndarray, qvel: np.ndarray, step: int) -> None:
     """Raise FloatingPointError where a simulation, ``[N, 7]``, has diverged."""
     sound = (np.abs(qpos) < 1e3).all(1) & (np.abs(qvel) < 1e6).all(1)  # false for NaN
     if not sound.all():
         door = int(np.flatnonzero(~sound)[0])
         raise FloatingPointError(
-            f"the simulation of door {first_door + door} diverged in step {step}: "
+            f"the simulation of door {door} diverged in step {step}: "
             f"joints at {qpos[door].tolist()}"
         )

@@ -2,6 +2,7 @@
 
 The paper tells the strategies apart by eye (Fig. 2b, 2c). Here it is a rule on forces: of all that
 the robot does to the handle in the direction of opening, which part does the inside of the hook?
+The part gives an episode its strategy, and the episodes' parts give one to a policy.
 """
 
 from __future__ import annotations

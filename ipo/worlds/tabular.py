@@ -7,13 +7,15 @@ writes down what MiniGrid does there. Everything else is look-up in that table.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import torch
 from gymnasium import Env
+from gymnasium.spaces import Discrete
+from minigrid.core.world_object import WorldObj
 from minigrid.minigrid_env import MiniGridEnv
 from torch import Tensor
 from tqdm import tqdm
@@ -67,59 +69,42 @@ def tabulate(env: Env, max_states: int = 100_000) -> TabularTask:
             numbers or give different results when repeated, or one with more than ``max_states``
             states.
     """
-    env = env.unwrapped
-    if not isinstance(env, MiniGridEnv):
-        raise NotTabularError(f"env = {env}: must be a MiniGridEnv")
-    index: dict[Any, int] = {}
-    states: list[Any] = []
-    images: dict[bytes, int] = {}
-    observation: list[int] = []
-    progress: list[int] = []
-    position: list[tuple[int, int]] = []
-
-    def visit(image: np.ndarray) -> int:
-        """The index of the present state of ``env``, which is remembered if it is new."""
-        key = _key(env)
-        if key not in index:
-            if len(states) == max_states:
-                raise NotTabularError(f"max_states = {max_states}: the task has more states")
-            index[key] = len(states)
-            states.append(_snapshot(env))
-            observation.append(images.setdefault(image.tobytes(), len(images)))
-            progress.append(getattr(env, "progress", 0))
-            position.append(tuple(map(int, env.agent_pos)))
-        return index[key]
-
+    env = _minigrid(env)
+    visited = _Visited(env, max_states)
     start: dict[int, float] = {}
     for probability, image in _all_starts(env):
-        state = visit(image)
+        state = visited.visit(image)
         start[state] = start.get(state, 0.0) + probability
-    shape, dtype = image.shape, image.dtype
-
-    goal_reward = np.empty(env.max_steps)
-    for step in range(env.max_steps):
-        env.step_count = step + 1
-        goal_reward[step] = env._reward()
-
+    assert isinstance(env.action_space, Discrete)
+    actions = range(env.action_space.n)
     rows: list[list[tuple[int, bool, bool]]] = []
     with tqdm(desc="tabulating", unit="state", leave=False) as bar:
-        while len(rows) < len(states):
-            state = len(rows)
-            rows.append([_step(env, states, state, a, visit) for a in range(env.action_space.n)])
+        while len(rows) < len(visited.snapshots):
+            rows.append([visited.step(len(rows), action) for action in actions])
             bar.update()
     table = np.array(rows)
     return TabularTask(
         next_state=table[..., 0].astype(np.int32),
         goal=table[..., 1].astype(bool),
         done=table[..., 2].astype(bool),
-        goal_reward=goal_reward,
-        start=np.array([start.get(state, 0.0) for state in range(len(states))]),
-        observation=np.array(observation, dtype=np.int32),
-        images=np.stack([np.frombuffer(i, dtype).reshape(shape) for i in images]),
-        progress=np.array(progress),
-        position=np.array(position),
-        signature=np.array([_signature(key) for key in index], dtype=np.uint64),
+        goal_reward=goal_reward(env),
+        start=np.array([start.get(state, 0.0) for state in range(len(rows))]),
+        observation=np.array(visited.observation, dtype=np.int32),
+        images=np.stack(visited.images),
+        progress=np.array(visited.progress),
+        position=np.array(visited.position),
+        signature=np.array([_signature(key) for key in visited.index], dtype=np.uint64),
     )
+
+
+def goal_reward(env: Env) -> np.ndarray:
+    """What MiniGrid gives for reaching the goal in step 1, 2, ... T; ``reset`` must follow."""
+    env = _minigrid(env)
+    rewards = np.empty(env.max_steps)
+    for step in range(env.max_steps):
+        env.step_count = step + 1
+        rewards[step] = env._reward()
+    return rewards
 
 
 def state_of(task: TabularTask, env: Env) -> int:
@@ -128,10 +113,10 @@ def state_of(task: TabularTask, env: Env) -> int:
     Raises:
         ValueError: an environment of another task.
     """
-    found = np.flatnonzero(task.signature == _signature(_key(env.unwrapped)))
-    if len(found) != 1:
+    states = np.flatnonzero(task.signature == _signature(_key(_minigrid(env))))
+    if len(states) != 1:
         raise ValueError(f"env = {env}: is in no state of this table")
-    return int(found[0])
+    return int(states[0])
 
 
 class TabularDomains:
@@ -209,10 +194,10 @@ class TabularEnvironments:
 
     def _starts(self) -> np.ndarray:
         uniform = np.stack([generator.random(len(self.domains)) for generator in self.generators])
-        found = np.searchsorted(self.table.starts, self.domains + uniform, side="right")
+        drawn = np.searchsorted(self.table.starts, self.domains + uniform, side="right")
         # The sums are rounded: a draw next to 0 or 1 could lead into the next domain.
         return np.clip(
-            found, self.table.first_start[self.domains], self.table.last_start[self.domains]
+            drawn, self.table.first_start[self.domains], self.table.last_start[self.domains]
         )
 
 
@@ -267,7 +252,7 @@ def occupancy(task: TabularTask, policy: np.ndarray) -> np.ndarray:
         total += present
         later = np.zeros_like(present)
         for action, next_state in enumerate(task.next_state.T):
-            np.add.at(later, (slice(None), next_state), present * goes_on[..., action])
+            np.add.at(later.T, next_state, (present * goes_on[..., action]).T)
         present = later
     return total
 
@@ -283,6 +268,61 @@ def optimal_policy(task: TabularTask) -> tuple[np.ndarray, float]:
         q = task.goal * task.goal_reward[t] + ~task.done * value[task.next_state]
         actions[t], value = q.argmax(1), q.max(1)
     return actions, float(task.start @ value)
+
+
+def _minigrid(env: Env) -> MiniGridEnv:
+    """The environment without wrappers."""
+    if not isinstance(env.unwrapped, MiniGridEnv):
+        raise NotTabularError(f"env = {env.unwrapped}: must be a MiniGridEnv")
+    return env.unwrapped
+
+
+class _Visited:
+    """States of an environment, numbered in the order in which they were seen first."""
+
+    def __init__(self, env: MiniGridEnv, max_states: int) -> None:
+        self.env, self.max_states = env, max_states
+        self.index: dict[Any, int] = {}  # from a state's key to its number
+        self.snapshots: list[Any] = []
+        self.images: list[np.ndarray] = []  # the distinct ones
+        self.image_index: dict[bytes, int] = {}
+        self.observation: list[int] = []
+        self.progress: list[int] = []
+        self.position: list[tuple[int, int]] = []
+
+    def visit(self, image: np.ndarray) -> int:
+        """The number of the present state, which looks like ``image``."""
+        key = _key(self.env)
+        if key not in self.index:
+            if len(self.index) == self.max_states:
+                raise NotTabularError(f"max_states = {self.max_states}: the task has more states")
+            self.index[key] = len(self.index)
+            self.snapshots.append(_snapshot(self.env))
+            seen = self.image_index.setdefault(image.tobytes(), len(self.images))
+            if seen == len(self.images):
+                self.images.append(image)
+            self.observation.append(seen)
+            self.progress.append(getattr(self.env, "progress", 0))
+            column, row = self.env.agent_pos
+            self.position.append((int(column), int(row)))
+        return self.index[key]
+
+    def step(self, state: int, action: int) -> tuple[int, bool, bool]:
+        """Next state, whether the goal was reached, whether the episode ended."""
+        env, outcomes = self.env, []
+        for _ in range(2):
+            _restore(env, self.snapshots[state])
+            env.step_count = 0
+            before = env.np_random.bit_generator.state
+            observation, reward, terminated, _, _ = env.step(action)
+            drew = env.np_random.bit_generator.state != before
+            outcomes.append((_key(env), reward, terminated))
+        if drew or outcomes[0] != outcomes[1]:
+            raise NotTabularError(
+                f"env = {env}: must be deterministic, but action {action} has random effects"
+            )
+        next_state = state if terminated else self.visit(observation["image"])
+        return next_state, float(reward) > 0, terminated
 
 
 class _Choices:
@@ -311,11 +351,18 @@ class _Choices:
         return bool(self.script)
 
 
-def _all_starts(env: Env):
+def _all_starts(env: MiniGridEnv) -> Iterator[tuple[float, np.ndarray]]:
     """Every layout that ``reset`` can draw: its probability and the first image."""
-    choices, own_generator = _Choices(), env.np_random
+    choices: Any = _Choices()
+    own_generator = env.np_random
 
-    def place(obj, top=None, size=None, reject_fn=None, max_tries=None):
+    def place(
+        obj: WorldObj | None,
+        top: tuple[int, int] | None = None,
+        size: tuple[int, int] | None = None,
+        reject_fn: Callable[[MiniGridEnv, tuple[int, int]], bool] | None = None,
+        max_tries: float | None = None,
+    ) -> tuple[int, int]:
         """MiniGrid tries cells until one is free; that is a uniform choice of the free ones."""
         left, up = (max(corner, 0) for corner in (top or (0, 0)))
         wide, high = size or (env.grid.width, env.grid.height)
@@ -332,7 +379,7 @@ def _all_starts(env: Env):
             env.put_obj(obj, *position)
         return position
 
-    env.place_obj = place
+    vars(env)["place_obj"] = place  # instead of the method
     try:
         while True:
             env.np_random = choices
@@ -341,11 +388,11 @@ def _all_starts(env: Env):
             if not choices.next_branch():
                 return
     finally:
-        del env.place_obj
+        del vars(env)["place_obj"]
         env.np_random = own_generator
 
 
-def _key(env: Env) -> Any:
+def _key(env: MiniGridEnv) -> Any:
     """What tells one state from another; MiniGrid's own hash leaves out what is carried."""
     carried = env.carrying.encode() if env.carrying else None
     pose = tuple(map(int, (*env.agent_pos, env.agent_dir)))
@@ -357,33 +404,14 @@ def _signature(key: Any) -> int:
     return int.from_bytes(hashlib.blake2b(repr(key).encode(), digest_size=8).digest())
 
 
-def _snapshot(env: Env) -> Any:
+def _snapshot(env: MiniGridEnv) -> Any:
     things = {id(thing): thing for thing in [*env.grid.grid, env.carrying] if thing is not None}
     contents = [(thing, dict(vars(thing))) for thing in things.values()]
     return env.grid, list(env.grid.grid), contents, env.agent_pos, env.agent_dir, env.carrying
 
 
-def _restore(env: Env, snapshot: Any) -> None:
+def _restore(env: MiniGridEnv, snapshot: Any) -> None:
     env.grid, cells, contents, env.agent_pos, env.agent_dir, env.carrying = snapshot
     env.grid.grid = list(cells)
     for thing, content in contents:
         vars(thing).update(content)
-
-
-def _step(
-    env: Env, states: list[Any], state: int, action: int, visit: Callable[[np.ndarray], int]
-) -> tuple[int, bool, bool]:
-    """Next state, whether the goal was reached, whether the episode ended."""
-    outcomes = []
-    for _ in range(2):
-        _restore(env, states[state])
-        env.step_count = 0
-        before = env.np_random.bit_generator.state
-        observation, reward, terminated, _, _ = env.step(action)
-        drew = env.np_random.bit_generator.state != before
-        outcomes.append((_key(env), reward, terminated))
-    if drew or outcomes[0] != outcomes[1]:
-        raise NotTabularError(
-            f"env = {env}: must be deterministic, but action {action} has random effects"
-        )
-    return state if terminated else visit(observation["image"]), reward > 0, terminated

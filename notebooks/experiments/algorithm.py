@@ -1,8 +1,8 @@
-"""From a family of scalar control problems to tidy rows, one per problem and metric."""
+"""From a family of scalar control problems to tidy rows, one per problem and metric; to tables."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,17 +11,34 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from experiments import players
+from experiments import games_played, players
 from experiments.experiment import Experiment
+from experiments.figures import OUTCOMES
+from experiments.origin import ROOT
 from experiments.rows import tidy
-from ipo.causality.scalar_control import costs
-from ipo.causality.vector_game import Settings, last, residual
+from experiments.store import Store, select
+from ipo.causality.scalar_control import costs, stationary_cost, unseen_cost
+from ipo.causality.small_games import GameSettings, last, residual
 from ipo.checks import check_choice
 from ipo.game import average
+from ipo.lqr import oracle_cost
 
 FAMILIES = ("given", "grid", "random")
 GRID = np.linspace(-1, 1, 21)
 START = (0.3, 0.0)
+UNSEEN = torch.tensor(np.random.default_rng(0).uniform(-1, 1, 200))  # betas that score a controller
+MARGIN = 0.01  # by which a method's score must differ to be better or worse
+
+NAMES = {
+    "pooled": "pooled gradient descent",
+    "ipo_plain": "IPO, plain steps",
+    "ipo_plain_large": "IPO, plain steps",
+    "ipo_bound0.5": "IPO, bound 0.5",
+    "ipo_bound1": "IPO, bound 1",
+    "ipo_bound2": "IPO, bound 2",
+    "ipo_bound5": "IPO, bound 5",
+    "ipo_adam": "IPO, one Adam per player",
+}
 
 
 @dataclass(frozen=True)
@@ -39,7 +56,7 @@ class Cell:
     """
 
     label: str
-    settings: Settings
+    settings: GameSettings
     betas: tuple[float | None, ...]
     family: str = "given"
     start: tuple[float, float] = START
@@ -54,7 +71,7 @@ class Cell:
         return {"method": self.label, "family": self.family, "betas": betas, "start": start}
 
 
-def standard(num_domains: int) -> dict[str, Settings]:
+def standard(num_domains: int) -> dict[str, GameSettings]:
     """The ways of training that the chapter compares, by their label in the rows.
 
     With plain steps, IPO's average moves by learning_rate / E times the mean gradient in a
@@ -64,23 +81,23 @@ def standard(num_domains: int) -> dict[str, Settings]:
     plain = {"learning_rate": 0.2 * num_domains, "num_rounds": 2000, "max_gradient_norm": 1.0}
     adam = {"optimizer": "adam", "learning_rate": 2e-3, "num_rounds": 4000}
     bounded = {
-        f"ipo_bound{bound:g}": Settings("ipo", bound=bound, **plain) for bound in (0.5, 1, 2, 5)
+        f"ipo_bound{bound:g}": GameSettings("ipo", bound=bound, **plain) for bound in (0.5, 1, 2, 5)
     }
     return bounded | {
-        "pooled": Settings("pooled", **(plain | {"learning_rate": 0.05})),
-        "pooled_adam": Settings("pooled", **adam),
-        "ipo_plain": Settings(
+        "pooled": GameSettings("pooled", **(plain | {"learning_rate": 0.05})),
+        "pooled_adam": GameSettings("pooled", **adam),
+        "ipo_plain": GameSettings(
             "ipo", **(plain | {"learning_rate": 0.002 * num_domains, "num_rounds": 10_000})
         ),
-        "ipo_plain_large": Settings("ipo", **(plain | {"learning_rate": 0.05 * num_domains})),
-        "ipo_plain_together": Settings(
+        "ipo_plain_large": GameSettings("ipo", **(plain | {"learning_rate": 0.05 * num_domains})),
+        "ipo_plain_together": GameSettings(
             "ipo", order="together", **(plain | {"learning_rate": 0.05 * num_domains})
         ),
-        "ipo_adam": Settings("ipo", **adam),
-        "ipo_adam_together": Settings("ipo", order="together", **adam),
-        "ipo_adam_large": Settings("ipo", **(adam | {"learning_rate": 2e-2})),
-        "ensemble_adam": Settings("ensemble", **adam),
-        "separate_adam": Settings("separate", **adam),
+        "ipo_adam": GameSettings("ipo", **adam),
+        "ipo_adam_together": GameSettings("ipo", order="together", **adam),
+        "ipo_adam_large": GameSettings("ipo", **(adam | {"learning_rate": 2e-2})),
+        "ensemble_adam": GameSettings("ensemble", **adam),
+        "separate_adam": GameSettings("separate", **adam),
     }
 
 
@@ -112,10 +129,163 @@ def run_cell(cell: Cell, seeds: list[int]) -> pd.DataFrame:
     return tidy(cell, seeds, metrics)
 
 
+def problem_cell(
+    label: str,
+    betas: tuple[float | None, ...],
+    family: str = "given",
+    start: tuple[float, float] = START,
+    num_rounds: int | None = None,
+) -> Cell:
+    """A cell that is trained in a standard way, for another number of rounds where one is given."""
+    settings = standard(len(betas))[label]
+    if num_rounds is not None:
+        settings = replace(settings, num_rounds=num_rounds)
+    return Cell(label, settings, betas, family, start)
+
+
+# ------------------------------------------------------------------------ tables of gains
+
+
 def gains_of(rows: pd.DataFrame) -> Tensor:
     """The gains ``[R, 2]`` in the rows of one cell, in the order of their runs."""
     wide = rows.pivot(index="run", columns="metric", values="value").sort_index()
     return torch.tensor(wide[["k_1", "k_2"]].to_numpy())
+
+
+def gains(rows: pd.DataFrame, cell: Cell) -> Tensor:
+    """The gains ``[R, 2]`` of a cell's problems."""
+    return gains_of(select(rows, cell.columns))
+
+
+def gains_text(gains: Tensor) -> str:
+    return f"({gains[0]:.3f}, {gains[1]:.3f})"
+
+
+def control_line(rows: pd.DataFrame, cell: Cell, elsewhere: Sequence[float]) -> dict[str, str]:
+    """Gains of a cell with one problem, what they cost in training and at betas ``elsewhere``."""
+    own = select(rows, cell.columns)
+    (k,) = gains_of(own)
+
+    def cost(*betas: float) -> str:
+        """The mean of what it costs, as text: it may be unstable for one of the betas."""
+        costs = stationary_cost(k, torch.tensor(betas, dtype=torch.float64))
+        return f"{costs.mean():.2f}" if bool(costs.isfinite().all()) else "unstable"
+
+    largest = own.loc[own["metric"] == "largest_weight", "value"].iloc[0]
+    return {
+        "training β": ", ".join(f"{beta:g}" for beta in cell.betas),
+        "method": NAMES[cell.label],
+        "k₁": f"{k[0]:.3f}",
+        "k₂": f"{k[1] + 0:.3f}".replace("-0.000", "0.000"),
+        "largest weight of a player": f"{largest:.1f}",
+        "training cost": cost(*cell.betas),
+    } | {f"β = {beta:g}": cost(beta) for beta in elsewhere}
+
+
+def starts_table(rows: pd.DataFrame, cells: Sequence[Cell]) -> pd.DataFrame:
+    """A line for each start, with the gains at which each method ends."""
+    lines: dict[tuple[float, float], dict[str, Any]] = {}
+    for cell in cells:
+        line = lines.setdefault(cell.start, {"start": f"({cell.start[0]:g}, {cell.start[1]:g})"})
+        (k,) = gains(rows, cell).tolist()
+        line[f"{NAMES[cell.label]}: k₁"], line[f"{NAMES[cell.label]}: k₂"] = k
+    return pd.DataFrame(lines.values())
+
+
+# --------------------------------------------------------------- where IPO wins, ties, loses
+
+
+def outcome(ipo: np.ndarray, pooled: np.ndarray) -> np.ndarray:
+    """Which of :data:`experiments.figures.OUTCOMES` it is, from costs of the same shape."""
+    with np.errstate(invalid="ignore"):
+        ratio = np.where(np.isinf(ipo), np.inf, ipo / pooled)  # 0 where only pooling is unstable
+    kinds = np.select([ratio < 1 - MARGIN, ratio > 1 + MARGIN], ["IPO better", "IPO worse"], "tie")
+    return np.where(np.isinf(ipo) & np.isinf(pooled), "both unstable", kinds)
+
+
+def score(rows: pd.DataFrame, cell: Cell) -> np.ndarray:
+    """Mean cost over unseen betas of every problem ``[R]``."""
+    return unseen_cost(gains(rows, cell), UNSEEN).numpy()
+
+
+def outcomes(rows: pd.DataFrame, ipo: Cell, pooled: Cell) -> np.ndarray:
+    """Problem by problem, ``[R]``, by their scores."""
+    return outcome(score(rows, ipo), score(rows, pooled))
+
+
+def shares_of_outcomes(rows: pd.DataFrame, ipo: Cell, pooled: Cell) -> dict[str, float]:
+    """The share of problems with each outcome."""
+    kinds = outcomes(rows, ipo, pooled)
+    return {kind: float((kinds == kind).mean()) for kind in OUTCOMES}
+
+
+def shares_beta_by_beta(rows: pd.DataFrame, ipo: Cell, pooled: Cell) -> dict[str, float]:
+    """Of all pairs of a problem and an unseen beta."""
+    costs = (
+        stationary_cost(gains(rows, cell).unsqueeze(1), UNSEEN).numpy() for cell in (ipo, pooled)
+    )
+    kinds = outcome(*costs)
+    return {
+        "β by β: better": float((kinds == "IPO better").mean()),
+        "worse": float((kinds == "IPO worse").mean()),
+    }
+
+
+def ablation_line(
+    rows: pd.DataFrame, cells: Mapping[tuple[int, str], Cell], label: str
+) -> dict[str, float]:
+    """How a method compares with pooling on random problems, by their number of domains."""
+    line = {}
+    for n in (2, 3):
+        kinds = outcomes(rows, cells[n, label], cells[n, "pooled"])
+        line[f"{n} domains: better"] = float((kinds == "IPO better").mean())
+        line[f"{n}: worse"] = float((kinds == "IPO worse").mean())
+        line[f"{n}: unstable"] = float(np.isinf(score(rows, cells[n, label])).mean())
+    return line
+
+
+# -------------------------------------------------------------------- players of networks
+
+
+def growth(rows: pd.DataFrame) -> pd.DataFrame:
+    """The rows of the distance between players, less what it was at the start of the run."""
+    distance = rows[rows["metric"] == "distance_players"].copy()
+    start = distance[distance["update"] == 0].set_index(["method", "run"])["value"]
+    of_row = pd.MultiIndex.from_frame(distance[["method", "run"]])
+    distance["value"] -= start.loc[of_row].to_numpy()
+    return distance
+
+
+def mean_of_players(rows: pd.DataFrame, update: int) -> pd.Series:
+    """Mean over runs after an update, by method and metric."""
+    return rows[rows["update"] == update].groupby(["method", "metric"])["value"].mean()
+
+
+# ------------------------------------------------------------------ Nash gaps of other kinds
+
+
+def lqr_gap(method: str) -> pd.Series:
+    """The Nash gap of a method in the shipped runs of LQR, relative to the oracle's cost.
+
+    Mean over runs, by the part of the training that is over.
+    """
+    rows = Store(ROOT / "data" / "results" / "lqr", "curves").rows()
+    own = rows[(rows["metric"] == "nash_gap") & (rows["method"] == method)]
+    gap = own.groupby("iteration")["value"].mean() / oracle_cost()
+    return gap.set_axis(gap.index / gap.index.max())
+
+
+def keys_gap(rows: pd.DataFrame, kind: str) -> pd.Series:
+    """The ``lower`` or ``upper`` bound on IPO's gap in coloured keys, relative to the best return.
+
+    Mean over runs, by the part of the training that is over.
+    """
+    ipo = rows[rows["method"] == "ipo"]
+    begun = ipo[(ipo["update"] == 0) & (ipo["run"] == 0)]
+    values = begun.set_index("metric")["value"]
+    best_return = values["gap_upper"] + values["return_exact"].min()
+    gap = ipo[ipo["metric"] == f"gap_{kind}"].groupby("update")["value"].mean() / best_return
+    return gap.set_axis(gap.index / ipo["update"].max())
 
 
 def short(cell: Cell) -> Cell:
@@ -123,10 +293,12 @@ def short(cell: Cell) -> Cell:
     return replace(cell, settings=replace(cell.settings, num_rounds=30))
 
 
-EXPERIMENTS = {
-    "table": Experiment(run_cell, Cell, short, (0,)),
-    "starts": Experiment(run_cell, Cell, short, (0,)),
-    "players": players.EXPERIMENT,
-} | {
-    name: Experiment(run_cell, Cell, short, (0, 1, 200)) for name in ("grid", "random", "ablation")
-}
+EXPERIMENTS = (
+    {name: Experiment(run_cell, Cell, short, (0,)) for name in ("table", "optima", "starts")}
+    | {
+        name: Experiment(run_cell, Cell, short, (0, 1, 200))
+        for name in ("grid", "random", "ablation")
+    }
+    | {"players": players.EXPERIMENT}
+    | games_played.EXPERIMENTS
+)

@@ -54,7 +54,7 @@ def authors_policies(repository: str | Path) -> dict[str, list[list[Weights]]]:
         FileNotFoundError: no policies there.
         ValueError: a file that is not one of theirs.
     """
-    found = {}
+    policies = {}
     for method in ("ppo", "ipo"):
         folder = Path(repository) / FOLDER / method
         paths = sorted(folder.glob("*.best.pt"))
@@ -62,8 +62,8 @@ def authors_policies(repository: str | Path) -> dict[str, list[list[Weights]]]:
             raise FileNotFoundError(
                 f"authors_repository = {str(repository)!r}: must have *.best.pt in {folder}"
             )
-        found[method] = [load_authors_policy(path) for path in paths]
-    return found
+        policies[method] = [load_authors_policy(path) for path in paths]
+    return policies
 
 
 def load_authors_policy(path: str | Path) -> list[Weights]:

@@ -21,7 +21,13 @@ from experiments import figures
 from experiments.experiment import Experiment
 from experiments.rows import tidy
 from experiments.store import select
-from ipo.causality.predictors import METHODS, Classification, Regression, Settings, icp
+from ipo.causality.icp import icp
+from ipo.causality.predictors import (
+    PREDICTOR_METHODS,
+    Classification,
+    PredictorSettings,
+    Regression,
+)
 from ipo.causality.scm import SCM, Linear, Normal, moments, population_regression
 from ipo.checks import check_choice, check_number
 
@@ -41,7 +47,7 @@ class Cell:
     """A method on a problem.
 
     Attributes:
-        method: one of :data:`ipo.causality.predictors.METHODS`, ``icp`` or ``oracle``.
+        method: one of :data:`ipo.causality.predictors.PREDICTOR_METHODS`, ``icp`` or ``oracle``.
         problem: one of :data:`VARIANTS` or :data:`PROBLEMS`, or ``digits``.
         level: what a problem of :data:`PROBLEMS` varies; zero otherwise.
         settings: how the method is trained; ``None`` for what is not trained by steps.
@@ -49,11 +55,11 @@ class Cell:
 
     method: str
     problem: str
-    settings: Settings | None
+    settings: PredictorSettings | None
     level: float = 0.0
 
     def __post_init__(self) -> None:
-        check_choice("method", self.method, (*METHODS, "icp", "oracle"))
+        check_choice("method", self.method, (*PREDICTOR_METHODS, "icp", "oracle"))
         check_choice("problem", self.problem, (*VARIANTS, *PROBLEMS, "digits"))
         check_number("level", self.level, least=0)
         if (self.settings is None) != (self.method in ("icp", "oracle")):
@@ -195,7 +201,7 @@ def fit(cell: Cell, features: list[Tensor], targets: list[Tensor], causal: np.nd
             icp([x[r] for x in features], [y[r] for y in targets]) for r in range(len(features[0]))
         ]
         return torch.tensor(np.stack([run.coefficients for run in runs]))
-    return METHODS[cell.method](Regression.from_samples(features, targets), cell.settings)
+    return PREDICTOR_METHODS[cell.method](Regression.from_samples(features, targets), cell.settings)
 
 
 def stack(runs: Sequence[Sequence[Domain]]) -> tuple[list[Tensor], list[Tensor]]:
@@ -314,7 +320,7 @@ def _run_digits(cell: Cell, seeds: list[int]) -> dict[tuple[str, str], Tensor]:
         )
         for name in runs[0]
     }
-    v = METHODS[method](task["train"], settings)
+    v = PREDICTOR_METHODS[method](task["train"], settings)
     risks = task["validation"].risks(v)
     return {
         ("train", "train_error"): task["train"].errors(v).mean(1),
@@ -326,9 +332,9 @@ def _run_digits(cell: Cell, seeds: list[int]) -> dict[tuple[str, str], Tensor]:
 
 
 # Nothing here was tuned on a test domain: the ridge was set once, for ERM on gray images.
-DIGITS = Settings(ridge=0.01, learning_rate=0.03, num_iterations=1000)
-CHAIN = Settings(learning_rate=0.003, num_iterations=5000, num_features=2 * DIM)
-SMALL = Settings(learning_rate=0.02, num_iterations=3000)
+DIGITS = PredictorSettings(ridge=0.01, learning_rate=0.03, num_iterations=1000)
+CHAIN = PredictorSettings(learning_rate=0.003, num_iterations=5000, num_features=2 * DIM)
+SMALL = PredictorSettings(learning_rate=0.02, num_iterations=3000)
 
 
 def short(cell: Cell) -> Cell | None:
@@ -350,7 +356,7 @@ FAILURE_METHODS = ("erm", "icp", "irmv1", "vrex", "irm_game_fixed_phi")
 
 
 def penalized(
-    problem: str, settings: Settings, penalties: Sequence[float], level: float = 0.0
+    problem: str, settings: PredictorSettings, penalties: Sequence[float], level: float = 0.0
 ) -> list[Cell]:
     """IRMv1 and V-REx with every weight of their penalty."""
     return [

@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import tempfile
 import warnings
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,8 @@ from typing import Any
 import numpy as np
 import safetensors.torch
 import torch
+
+from experiments.files import replace_bytes
 
 TENSOR = "tensor:"  # what stands in the JSON for a tensor, before its name
 DIGEST_LENGTH = 64
@@ -46,20 +47,14 @@ def save_checkpoint(path: str | Path, tree: Any) -> None:
     plain = json.dumps(_take_tensors(tree, "", tensors))
     content = safetensors.torch.save(tensors, {"tree": plain})
     digest = hashlib.sha256(content).hexdigest().encode()
-    temporary = None
+    new = path.with_name(f"{path.name}.new")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".tmp", delete=False) as file:
-            temporary = Path(file.name)
-            file.write(digest + b"\n" + content)
-            file.flush()
-            os.fsync(file.fileno())
+        replace_bytes(new, digest + b"\n" + content)
         if path.exists():
             os.replace(path, previous(path))
-        os.replace(temporary, path)
+        os.replace(new, path)
     except OSError as error:
-        if temporary is not None:
-            temporary.unlink(missing_ok=True)
         raise CheckpointError(
             f"{path}: cannot be written ({error.strerror}); the check-points before it are whole"
         ) from error

@@ -21,13 +21,13 @@ from experiments.door_training import (
     EVALUATION_SEED,
     NETWORK,
     TRAIN_FRICTIONS,
-    opened,
+    last_info,
     policy_path,
 )
 from experiments.experiment import Experiment
 from ipo.checks import check_choice, check_count
 from ipo.distributions import Gaussian
-from ipo.networks import Weights, load_policy
+from ipo.networks import Weights
 from ipo.worlds.door import DoorEnv, DoorParams
 from ipo.worlds.hooking import Hooking
 from ipo.worlds.pulling import strategy
@@ -104,7 +104,7 @@ def evaluate(cell: Cell, seeds: Sequence[int], policies: str | Path) -> pd.DataF
     for seed in seeds:
         players = load_players(cell, seed, policies)
         for friction in cell.frictions:
-            found = opened(players, friction, cell.num_doors, EVALUATION_SEED)
+            found = last_info(players, friction, cell.num_doors, EVALUATION_SEED)
             parts.append(
                 pd.DataFrame(
                     {
@@ -113,7 +113,7 @@ def evaluate(cell: Cell, seeds: Sequence[int], policies: str | Path) -> pd.DataF
                         "domain": str(friction),
                         "door": range(cell.num_doors),
                         "metric": "success",
-                        "value": found.astype(float),
+                        "value": found["opened"].astype(float),
                     }
                 )
             )
@@ -122,8 +122,9 @@ def evaluate(cell: Cell, seeds: Sequence[int], policies: str | Path) -> pd.DataF
 
 def load_players(cell: Cell, seed: int, policies: str | Path) -> list[Weights]:
     """The players of a run who act."""
-    path = policy_path(policies, cell.trained.label, seed, cell.updates, cell.choice)
-    players, _ = load_policy(path, NETWORK, {"seed": seed, "choice": cell.choice})
+    players = door_training.load_players(
+        policies, cell.trained.label, seed, cell.updates, cell.choice
+    )
     return players if cell.player is None else [players[cell.player]]
 
 
@@ -136,7 +137,8 @@ def door_seeds(num_doors: int = NUM_DOORS) -> list[int]:
 def evaluation_doors(num_doors: int = NUM_DOORS) -> pd.DataFrame:
     """What the doors of the evaluation are like: a row for each, without its friction.
 
-    The columns are those of ``DoorParams``, ``lever_arm``, and the handle's shift.
+    The columns are those of ``DoorParams``, ``lever_arm``, the handle's shift, and ``lever``: from
+    the hinge to the shifted handle.
     """
     rows = []
     for seed in door_seeds(num_doors):
@@ -144,7 +146,8 @@ def evaluation_doors(num_doors: int = NUM_DOORS) -> pd.DataFrame:
         env.reset(seed=seed)
         y, z = env.handle_shift
         lever_arm = env.params.lever_arm
-        rows.append(asdict(env.params) | {"lever_arm": lever_arm, "shift_y": y, "shift_z": z})
+        levers = {"lever_arm": lever_arm, "lever": lever_arm - y}
+        rows.append(asdict(env.params) | levers | {"shift_y": y, "shift_z": z})
     return pd.DataFrame(rows).drop(columns="friction").rename_axis("door").reset_index()
 
 

@@ -7,27 +7,21 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
-import torch
 from tqdm import tqdm
 
 from experiments import door_training
 from experiments.door_training import (
     EVALUATION_SEED,
-    NETWORK,
     TRAIN_FRICTIONS,
-    copied,
-    make_doors,
+    last_info,
+    load_players,
     policy_path,
 )
 from experiments.experiment import Experiment
+from experiments.rows import tidy
 from ipo.checks import check_count
-from ipo.distributions import Gaussian
-from ipo.networks import Weights, load_policy
-from ipo.ppo import Training, improve
-from ipo.rollouts import collect
-from ipo.worlds.many_doors import VectorDoor
+from ipo.networks import Weights
 
 
 @dataclass(frozen=True)
@@ -59,76 +53,28 @@ class Cell:
 def gains_alone(cell: Cell, seeds: Sequence[int], policies: str | Path) -> pd.DataFrame:
     """Rows with the mean return in every player's domain, ``before`` and ``after`` it went on.
 
-    The largest gain of a player is a lower bound on the Nash gap of the run.
+    Actions are the most likely ones, at the doors of the evaluation. The largest gain of a player
+    is a lower bound on the Nash gap of the run.
     """
-    rows = []
+    parts = []
     for seed in seeds:
-        path = policy_path(policies, cell.trained.label, seed, cell.updates, "last")
-        players, _ = load_policy(path, NETWORK, {"seed": seed, "choice": "last"})
+        players = load_players(policies, cell.trained.label, seed, cell.updates, "last")
+        metrics = {}
         for d, friction in enumerate(TRAIN_FRICTIONS):
-            better = gone_on(cell, seed, players, d)
-            found = {
-                "before": mean_return(players, friction, cell.num_doors),
-                "after": mean_return(better, friction, cell.num_doors),
-            }
-            rows += [
-                {
-                    **cell.columns,
-                    "run": seed,
-                    "domain": str(friction),
-                    "metric": metric,
-                    "value": value,
-                }
-                for metric, value in found.items()
-            ]
-    return pd.DataFrame(rows)
+            for name, own in (("before", players), ("after", gone_on(cell, seed, players, d))):
+                found = last_info(own, friction, cell.num_doors, EVALUATION_SEED)
+                metrics[str(friction), name] = [found["episode_return"].mean()]
+        parts.append(tidy(cell, [seed], metrics))
+    return pd.concat(parts, ignore_index=True)
 
 
 def gone_on(cell: Cell, seed: int, players: Sequence[Weights], d: int) -> list[Weights]:
     """The players after player d has learnt for some updates, in its own doors, alone."""
-    settings = cell.trained.settings
-    training = Training(NETWORK, NETWORK.start, make_doors, len(TRAIN_FRICTIONS), settings, [seed])
-    with torch.no_grad():
-        for own, saved in zip(training.players, players, strict=True):
-            for name, weight in own.items():
-                weight.copy_(saved[name])
-    observations = training.observations[d]
+    training = door_training.new_training(cell.trained.settings, seed)
+    training.set_players(players)
     for _ in tqdm(range(cell.num_alone), desc=f"player {d}", unit="update", leave=False):
-        rollout, observations = collect(
-            NETWORK.frozen(training.players),
-            NETWORK.distribution,
-            training.environments[d],
-            observations,
-            settings.num_steps,
-            training.draws,
-            training.normalizers[d],
-            settings.discount,
-            settings.gae_lambda,
-            settings.time_outs,
-        )
-        improve(
-            NETWORK,
-            training.players,
-            d,
-            training.optimizers[d],
-            rollout.frames(),
-            settings,
-            training.orders,
-        )
-    return copied(training.players)
-
-
-def mean_return(players: Sequence[Weights], friction: float, num_doors: int) -> float:
-    """Of the most likely actions of the players' average, over the doors of the evaluation."""
-    doors = VectorDoor([friction] * num_doors)
-    policy = NETWORK.frozen(players)
-    observations, _ = doors.reset(seed=EVALUATION_SEED)
-    while True:
-        rows = torch.tensor(observations, dtype=torch.float32).unsqueeze(0)
-        actions = Gaussian.mode(policy(rows)[0])[0]
-        observations, _, _, truncated, info = doors.step(actions.numpy())
-        if truncated.all():
-            return float(np.mean(info["episode_return"]))
+        training.update(only=d)
+    return training.players
 
 
 def short(cell: Cell) -> Cell:

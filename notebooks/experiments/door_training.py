@@ -19,11 +19,11 @@ from tqdm import tqdm
 
 from experiments.checkpoints import CheckpointError, load_checkpoint, save_checkpoint
 from experiments.experiment import Experiment
-from ipo.dense_network import DenseNetwork
+from experiments.policies import load_policy, save_policy
 from ipo.distributions import Gaussian
-from ipo.networks import Weights, save_policy
-from ipo.ppo import Settings, Training
-from ipo.vector_environments import FromGymnasium
+from ipo.networks import DenseNetwork, Weights, copied
+from ipo.ppo import PPOSettings, Training
+from ipo.rollouts import FromGymnasium
 from ipo.worlds.many_doors import VectorDoor
 
 TRAIN_FRICTIONS = (0.0, 0.1)
@@ -34,7 +34,7 @@ CHOICES = ("best", "last")
 EVALUATION_SEED = 20210607  # of the doors that all policies are tested on
 
 
-def published(method: str, **changes: Any) -> Settings:
+def published_door(method: str, **changes: Any) -> PPOSettings:
     """The settings of the paper's runs on doors (Table 7), with ``changes``.
 
     Where the published runs differ from the text, these are the runs': the table's batch size of
@@ -54,7 +54,7 @@ def published(method: str, **changes: Any) -> Settings:
         "normalize_advantages": "rollout",
         "time_outs": "no_advantage",
     }
-    return Settings(method, **(paper | changes))
+    return PPOSettings(method, **(paper | changes))
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class Cell:
     """
 
     label: str
-    settings: Settings
+    settings: PPOSettings
     saved_after: tuple[int, ...] = (95, 190)
     curve_every: int = 10
 
@@ -90,10 +90,10 @@ class Cell:
 CELLS = {
     cell.label: cell
     for cell in (
-        Cell("ppo", published("ppo")),
-        Cell("ipo", published("ipo")),
-        Cell("ipo_lr1e-3", published("ipo", learning_rate=1e-3)),
-        Cell("ensemble", published("ensemble", learning_rate=5e-4)),
+        Cell("ppo", published_door("ppo")),
+        Cell("ipo", published_door("ipo")),
+        Cell("ipo_lr1e-3", published_door("ipo", learning_rate=1e-3)),
+        Cell("ensemble", published_door("ensemble", learning_rate=5e-4)),
     )
 }
 
@@ -142,9 +142,7 @@ class Run:
     def __init__(self, cell: Cell, seed: int, checkpoints: Path, policies: Path) -> None:
         self.cell, self.seed, self.policies = cell, seed, policies
         self.checkpoint = checkpoints / f"{cell.label}_{seed}.checkpoint"
-        self.training = Training(
-            NETWORK, NETWORK.start, make_doors, len(TRAIN_FRICTIONS), cell.settings, [seed]
-        )
+        self.training = new_training(cell.settings, seed)
         self.num_updates = 0
         self.cpu_seconds = 0.0
         self.best_return = -np.inf
@@ -166,8 +164,8 @@ class Run:
         self.num_updates += 1
         self._note_episodes()
         if self.num_updates % self.cell.curve_every == 0:
-            found = opened(self.training.players, CURVE_FRICTION, NUM_CURVE_DOORS, CURVE_SEED)
-            self._note(CURVE_FRICTION, "success_most_likely", found.mean())
+            found = last_info(self.training.players, CURVE_FRICTION, NUM_CURVE_DOORS, CURVE_SEED)
+            self._note(CURVE_FRICTION, "success_most_likely", found["opened"].mean())
         self.cpu_seconds += time.process_time() - before
         self._note("training", "cpu_seconds", self.cpu_seconds)
         if self.num_updates in self.cell.saved_after:
@@ -201,8 +199,8 @@ class Run:
         that end together, the doors with more friction come last.
         """
         frictions, returns, successes = [], [], []
-        for environments in self.training.environments:
-            doors = environments.envs
+        for collector in self.training.collectors:
+            doors = collector.environments.envs
             for episode_returns, episode_opened in doors.episodes:
                 frictions.extend(doors.frictions)
                 returns.extend(episode_returns)
@@ -251,6 +249,11 @@ class Run:
             setattr(self, name, state[name])
 
 
+def new_training(settings: PPOSettings, seed: int) -> Training:
+    """One run of training on doors, from its start."""
+    return Training(NETWORK, make_doors, len(TRAIN_FRICTIONS), settings, [seed])
+
+
 def make_doors(
     domains: list[int], num_copies: list[int], generators: Sequence[np.random.Generator]
 ) -> FromGymnasium:
@@ -260,13 +263,16 @@ def make_doors(
     return FromGymnasium(VectorDoor(frictions.tolist()), 1, int(generator.integers(2**63)))
 
 
-def opened(
+def last_info(
     players: Sequence[Weights], friction: float, num_doors: int, seed: int, **options: Any
-) -> np.ndarray:
-    """Which of ``num_doors`` fresh doors the players' average opens, by its most likely actions.
+) -> dict[str, np.ndarray]:
+    """What the players' average makes of fresh doors in one episode, by its most likely actions.
 
     The doors and the starts are those of the seed, whoever is asked and at every friction.
     ``options`` are those of :class:`ipo.worlds.many_doors.VectorDoor`.
+
+    Returns:
+        the ``info`` of the last step, such as ``opened`` and ``episode_return``, each ``[N]``.
     """
     doors = VectorDoor([friction] * num_doors, **options)
     try:
@@ -277,7 +283,7 @@ def opened(
             actions = Gaussian.mode(policy(rows)[0])[0]
             observations, _, _, truncated, info = doors.step(actions.numpy())
             if truncated.all():
-                return info["opened"]
+                return info
     finally:
         doors.close()
 
@@ -289,8 +295,12 @@ def policy_path(
     return Path(folder) / f"{label}_{seed}_{num_updates}_{choice}.safetensors"
 
 
-def copied(players: Sequence[Weights]) -> list[Weights]:
-    return [{name: w.detach().clone() for name, w in player.items()} for player in players]
+def load_players(
+    folder: str | Path, label: str, seed: int, num_updates: int, choice: str = "best"
+) -> list[Weights]:
+    """The players of a run, from its file."""
+    path = policy_path(folder, label, seed, num_updates, choice)
+    return load_policy(path, NETWORK, {"seed": seed, "choice": choice})[0]
 
 
 def listed(tree: Any) -> Any:
@@ -300,7 +310,7 @@ def listed(tree: Any) -> Any:
     return [listed(part) for part in tree] if isinstance(tree, list | tuple) else tree
 
 
-def shorter(settings: Settings) -> Settings:
+def shorter(settings: PPOSettings) -> PPOSettings:
     """The same with short rollouts and as many frames in a minibatch."""
     return replace(settings, num_steps=512, num_minibatches=32)
 

@@ -221,18 +221,36 @@ def network_graph(
     return nodes, edges
 
 
-def trajectories(energies: dict[str, np.ndarray], oracle: str) -> Figure:
-    """``|s_t|^2`` over time for several starts: ``{method: [starts, time]}``, median and range."""
+def trajectories(rows: pd.DataFrame, oracle: str) -> Figure:
+    """``|s_t|^2`` over time by method: quantiles ``energy_q05, _q50, _q95`` over starts."""
     fig, ax = plt.subplots(figsize=(7, 3.8))
-    for method, energy in energies.items():
+    for method, energy in rows.groupby("method", sort=False):
         name, color, _ = STYLES[method]
-        steps = np.arange(energy.shape[1])
-        low, middle, high = np.quantile(energy, [0.05, 0.5, 0.95], axis=0)
+        low, middle, high = energy.pivot(index="metric", columns="step", values="value").to_numpy()
+        steps = np.arange(len(middle))
         ax.plot(steps, middle, color=color, label=name, ls="--" if method == oracle else "-")
         ax.fill_between(steps, low, high, color=color, alpha=0.15, lw=0)
     ax.set(yscale="log", xlabel="time step", ylabel="$|s_t|^2$", ylim=(1e-6, None))
     ax.legend()
     return fig
+
+
+def draw_optimizers(ax: Axes, points: pd.DataFrame, x: str, y: str) -> None:
+    """Every run as a point: a colour per method, a mark per optimiser.
+
+    Runs with plain steps and L-BFGS have large hollow marks and crosses, for they may coincide.
+    """
+    for (method, optimizer), runs in points.groupby(["method", "optimizer"]):
+        name, color, marker = STYLES[method]
+        hollow = {"marker": marker, "facecolors": "none", "edgecolors": color}
+        look = {
+            "adam": {"s": 22, "marker": marker, "facecolors": color, "alpha": 0.8},
+            "none": {"s": 18, "marker": marker, "facecolors": color},
+            "plain": {"s": 110, **hollow},
+            "lbfgs": {"s": 110, "marker": "x", "color": color, "lw": 1},
+        }[optimizer]
+        suffix = {"adam": ", Adam", "none": "", "plain": ", plain", "lbfgs": ", L-BFGS"}[optimizer]
+        ax.scatter(runs[x], runs[y], label=name + suffix, **look)
 
 
 def causal_graph(
@@ -282,6 +300,62 @@ def interval_lines(
     """:func:`draw_metric` with a dashed line for a predictor from the causes."""
     draw_metric(ax, rows, metric, x, [m for m in methods if m in set(rows["method"])])
     ax.axhline(baseline, color="black", lw=1, ls="--", label="from the causes")
+
+
+def write_numbers(
+    ax: Axes, cells: np.ndarray, light: np.ndarray, form: str = "{}", fontsize: int = 8
+) -> None:
+    """The numbers of a picture ``[rows, columns]`` in its cells, white where it is dark.
+
+    ``light`` says where to write in white; nothing is written where a number is NaN.
+    """
+    for (y, x), value in np.ndenumerate(cells):
+        if not np.isnan(value):
+            ink = "white" if light[y, x] else "black"
+            text = form.format(value)
+            ax.text(x, y, text, ha="center", va="center", fontsize=fontsize, color=ink)
+
+
+def agents_view(picture: np.ndarray, image: np.ndarray) -> Figure:
+    """A grid, and the three channels of MiniGrid's ``image [7, 7, 3]`` that is seen of it."""
+    fig, axes = plt.subplots(1, 4, figsize=(10, 2.9))
+    axes[0].imshow(picture)
+    axes[0].set_title("grid, view highlighted", fontsize=10)
+    for ax, codes, name in zip(axes[1:], image.T, ("object", "colour", "state"), strict=True):
+        ax.imshow(codes, cmap="viridis", vmin=0, vmax=10)
+        write_numbers(ax, codes, light=codes < 7, fontsize=7)
+        ax.set_title(name, fontsize=10)
+    for ax in axes:
+        ax.axis("off")
+    return fig
+
+
+def draw_gaps(ax: Axes, gaps: np.ndarray, paper: float) -> None:
+    """How differences of two arms are distributed, with the paper's in either direction."""
+    ax.hist(gaps, bins=120, color="#0072B2", alpha=0.75)
+    for gap, style in ((paper, "-"), (-paper, "--")):
+        ax.axvline(gap, color="black", ls=style, label=f"{gap:+.2f}")
+    ax.axvline(0, color="0.6", lw=1)
+    ax.set(yticks=[])
+    ax.legend(title="the paper's gap")
+
+
+def time_in_cells(panels: Mapping[str, np.ndarray], phases: Sequence[str]) -> Figure:
+    """Expected steps in each cell of a grid: ``{title: [phase, row, column]}``, a column each."""
+    fig, axes = plt.subplots(len(phases), len(panels), figsize=(9, 6.6), sharex=True, sharey=True)
+    top = max(grid.max() for grid in panels.values())
+    for column, (title, grid) in zip(axes.T, panels.items(), strict=True):
+        column[0].set_title(f"{title}: {grid.sum():.1f} steps", fontsize=10)
+        for ax, cells in zip(column, grid, strict=True):
+            ax.set_facecolor("0.93")
+            visited = np.where(cells > 0, cells, np.nan)
+            picture = ax.imshow(visited, cmap="magma_r", norm="symlog", vmin=0, vmax=top)
+            write_numbers(ax, np.where(cells >= 0.05, cells, np.nan), cells > 3, "{:.1f}")
+            ax.set(xticks=[], yticks=[])
+            ax.grid(False)
+    for ax, phase in zip(axes[:, 0], phases, strict=True):
+        ax.set_ylabel(phase)
+    fig.colorbar(picture, ax=axes, label="expected steps", shrink=0.7)
 
 
 def decision_process(process: SCM, policy: SCM) -> Figure:

@@ -1,38 +1,57 @@
-"""From a configuration of the coloured-keys experiment to tidy rows, and to saved policies."""
+"""The coloured-keys experiment: arms, their rows and saved policies, and what is read off them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import itertools
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
+import scipy.special
+import scipy.stats
 import torch
 from minigrid.core.constants import OBJECT_TO_IDX
 
 from experiments.experiment import Experiment
+from experiments.policies import load_policy, save_policy
 from experiments.rows import tidy
+from experiments.tables import mean_and_std
 from experiments.tabulated import load_or_tabulate
 from ipo.checks import check_choice
 from ipo.distributions import Categorical
-from ipo.networks import GridNetwork, OnTable, Weights, save_policy
-from ipo.ppo import Settings, train
+from ipo.networks import GridNetwork, OnTable, Weights
+from ipo.ppo import PPOSettings, Training
+from ipo.stats import paired_difference, probability_of_improvement
 from ipo.worlds.colored_keys import COLORS, ColoredKeysEnv
 from ipo.worlds.tabular import (
     TabularDomains,
     TabularTask,
     expected_return,
+    occupancy,
     optimal_policy,
     reach,
     tabulate,
 )
 
+TRAINED, TESTED = ("red", "green"), "grey"
 ENCODINGS = ("integer", "one_hot", "none")
 COLOR_CHANNEL = 1
 NUM_COPIES, NUM_EPISODES = 50, 100  # of the published evaluation
 NUM_SAVED = 10  # runs of a cell whose weights are kept
+
+
+def published(method: str, **changes: Any) -> PPOSettings:
+    """The settings of the paper's runs on the coloured keys, with ``changes``."""
+    paper = {
+        "learning_rate": 5e-4 if method == "ipo" else 1e-3,
+        "time_outs": "terminal",
+        "skip_last_frames": True,
+    }
+    return PPOSettings(method, **(paper | changes))
 
 
 @dataclass(frozen=True)
@@ -49,8 +68,8 @@ class Cell:
     """
 
     label: str
-    settings: Settings
-    train_colors: tuple[str, ...] = ("red", "green")
+    settings: PPOSettings
+    train_colors: tuple[str, ...] = TRAINED
     color_encoding: str = "integer"
     size: int = 5
 
@@ -78,6 +97,82 @@ class Cell:
         }
 
 
+def arm(
+    label: str,
+    method: str,
+    train_colors: tuple[str, ...] = TRAINED,
+    color_encoding: str = "integer",
+    size: int = 5,
+    **changes: Any,
+) -> Cell:
+    """An arm of the experiment: the published settings, but for what is named."""
+    return Cell(label, published(method, **changes), train_colors, color_encoding, size)
+
+
+# Arms by label, as tables name them.
+MAIN = {
+    "ppo": "PPO, as published",
+    "ipo": "IPO, as published",
+    "ppo_lr5e-4": "PPO, IPO's learning rate",
+    "ipo_lr1e-3": "IPO, PPO's learning rate",
+    "ensemble": "ensemble, pooled data",
+}
+SETTINGS = {
+    "ppo": "PPO, as published",
+    "ipo": "IPO, as published",
+    "ppo_3colors": "PPO, red, green and blue",
+    "ipo_3colors": "IPO, red, green and blue",
+    "ppo_normalized": "PPO, advantages normalised",
+    "ipo_normalized": "IPO, advantages normalised",
+}
+LARGER = {
+    "ppo": "PPO, 122,880 frames",
+    "ipo": "IPO, 122,880 frames",
+    "ppo_long": "PPO, four times as many",
+    "ipo_long": "IPO, four times as many",
+}
+
+
+def main_arms(num_updates: int) -> list[Cell]:
+    """PPO and IPO as published, each with the other's learning rate, and IPO without the game."""
+    of = partial(arm, num_updates=num_updates)
+    return [
+        of("ppo", "ppo"),
+        of("ipo", "ipo"),
+        of("ppo_lr5e-4", "ppo", learning_rate=5e-4),
+        of("ipo_lr1e-3", "ipo", learning_rate=1e-3),
+        of("ensemble", "ensemble", learning_rate=5e-4),
+    ]
+
+
+def variant_arms(num_updates: int) -> list[Cell]:
+    """A third colour, normalised advantages, a test inside the range of codes, other encodings."""
+    of = partial(arm, num_updates=num_updates)
+    arms = []
+    for method in ("ppo", "ipo"):
+        arms += [
+            of(f"{method}_3colors", method, ("red", "green", "blue")),
+            of(f"{method}_normalized", method, normalize_advantages="minibatch"),
+            of(f"{method}_inside", method, ("red", "yellow")),
+        ]
+    for encoding in ("one_hot", "none"):
+        arms += [
+            of("ppo", "ppo", color_encoding=encoding),
+            of("ipo", "ipo", color_encoding=encoding),
+            of("ensemble", "ensemble", color_encoding=encoding, learning_rate=5e-4),
+        ]
+    return arms
+
+
+def larger_arms(num_updates: int, size: int) -> list[Cell]:
+    """Both methods on a larger grid, with the same number of updates and four times as many."""
+    return [
+        arm(f"{method}{suffix}", method, size=size, num_updates=factor * num_updates)
+        for suffix, factor in (("", 1), ("_long", 4))
+        for method in ("ppo", "ipo")
+    ]
+
+
 def run_cell(
     cell: Cell, seeds: list[int], tables: str | Path, policies: str | Path | None = None
 ) -> pd.DataFrame:
@@ -97,10 +192,17 @@ def run_cell(
 
 def run_curve(cell: Cell, seeds: list[int], tables: str | Path) -> pd.DataFrame:
     """Exact returns in every colour after each update: rows with a column ``frames``."""
-    task = Keys(tables, cell.color_encoding, cell.size)
-    parts = []
-    for frames, players in task.train(cell, seeds):
-        parts.append(tidy(cell, seeds, exact(task, players), frames=frames))
+    return curve(Keys(tables, cell.color_encoding, cell.size), cell, seeds, exact)
+
+
+def curve(
+    task: Keys, cell: Cell, seeds: Sequence[int], measure: Callable[..., dict[tuple[str, str], Any]]
+) -> pd.DataFrame:
+    """Rows of ``measure(task, players)`` before training and after each update."""
+    parts = [
+        tidy(cell, seeds, measure(task, players), frames=frames)
+        for frames, players in task.train(cell, seeds)
+    ]
     return pd.concat(parts, ignore_index=True)
 
 
@@ -116,11 +218,10 @@ class Keys:
         self.network = GridNetwork(encode(self.tasks["red"].images, color_encoding).shape[-1])
 
     def train(self, cell: Cell, seeds: list[int]) -> Iterator[tuple[int, list[Weights]]]:
-        """:func:`ipo.ppo.train` in the cell's training colours."""
+        """:meth:`ipo.ppo.Training.reports` in the cell's training colours."""
         domains = TabularDomains([self.tasks[color] for color in cell.train_colors])
         network = OnTable(self.network, encode(domains.images, self.color_encoding))
-        num_domains = len(cell.train_colors)
-        return train(network, self.network.start, domains, num_domains, cell.settings, seeds)
+        return Training(network, domains, len(cell.train_colors), cell.settings, seeds).reports()
 
     def logits(self, players: Sequence[Weights], images: np.ndarray) -> torch.Tensor:
         """Of the average policy ``[R, K, A]`` for MiniGrid's ``images [K, 7, 7, 3]``.
@@ -130,6 +231,26 @@ class Keys:
         images = encode(images, self.color_encoding)
         doubled = [{name: w.double() for name, w in player.items()} for player in players]
         return OnTable(self.network, images.double()).average(doubled)[0]
+
+    def policy(self, players: Sequence[Weights], color: str) -> np.ndarray:
+        """Probabilities ``[R, K, A]`` of the average policy in a colour, by observation."""
+        return self.logits(players, self.tasks[color].images).softmax(-1).numpy()
+
+    def saved(self, cell: Cell, policies: Path) -> tuple[list[Weights], list[int]]:
+        """Weights of the saved runs of a cell, a dictionary per player, and their seeds."""
+        path = policies / f"{cell.name}.safetensors"
+        players, about = load_policy(path, self.network, {"cell": cell.name})
+        return players, about["seeds"]
+
+
+def returns(
+    task: Keys, players: Sequence[Weights], colors: Sequence[str] = COLORS
+) -> dict[tuple[str, str], np.ndarray]:
+    """The exact return ``[R]`` alone of :func:`exact`, in some colours."""
+    return {
+        (color, "return_exact"): expected_return(task.tasks[color], task.policy(players, color))[0]
+        for color in colors
+    }
 
 
 def exact(task: Keys, players: Sequence[Weights]) -> dict[tuple[str, str], np.ndarray]:
@@ -223,14 +344,18 @@ class Grid:
 
 def run_grid(grid: Grid, seeds: list[int]) -> pd.DataFrame:
     """How large the table of a grid is; nothing about it is random."""
-    task = tabulate(ColoredKeysEnv(size=grid.size), max_states=1_000_000)
-    counts = {
+    facts = description(tabulate(ColoredKeysEnv(size=grid.size), max_states=1_000_000))
+    return tidy(grid, seeds, {(TESTED, name): [value] for name, value in facts.items()})
+
+
+def description(task: TabularTask) -> dict[str, float]:
+    """How large a table is, and what the best policy, which knows the state, gets."""
+    return {
         "layouts": (task.start > 0).sum(),
         "states": len(task.start),
         "distinct observations": len(task.images),
         "optimal return": optimal_policy(task)[1],
     }
-    return tidy(grid, seeds, {("grey", name): [count] for name, count in counts.items()})
 
 
 def short(cell: Cell) -> Cell | None:
@@ -249,3 +374,226 @@ EXPERIMENTS = {
     "curves": Experiment(run_curve, Cell, short, runs_at_once=25),
     "grids": Experiment(run_grid, Grid, lambda grid: grid if grid.size == 5 else None, (0,)),
 }
+
+
+# ------------------------------------------------------------------------- read off the rows
+
+
+def runs_of(rows: pd.DataFrame, method: str, color: str, metric: str = "return_exact") -> pd.Series:
+    """Values of all runs of an arm in a colour's domain, by run."""
+    chosen = rows[(rows["method"] == method) & (rows["domain"] == color)]
+    return chosen[chosen["metric"] == metric].set_index("run")["value"].sort_index()
+
+
+def table_by(
+    rows: pd.DataFrame,
+    names: Mapping[str, str],
+    metric: str,
+    colors: Sequence[str] = COLORS,
+    paper: pd.DataFrame | None = None,
+) -> pd.DataFrame:
+    """Mean ± standard deviation over runs by arm and colour, and what the paper has for them."""
+    chosen = rows[(rows["metric"] == metric) & rows["domain"].isin(colors)]
+    table = chosen.groupby(["method", "domain"])["value"].apply(mean_and_std, 3).unstack()
+    table = table.loc[list(names), list(colors)]
+    if paper is not None:
+        theirs = paper.pivot(index="method", columns="domain", values="text")
+        for color in colors:
+            table[f"{color}, paper"] = theirs[color].reindex(table.index).fillna("")
+    return table.rename(index=names).rename_axis("arm").reset_index()
+
+
+def beside(shipped: pd.DataFrame, rows: pd.DataFrame) -> pd.DataFrame:
+    """Rows computed again, with the shipped values of the same runs and the ``difference``."""
+    same = [column for column in rows.columns if column != "value"]
+    both = rows.merge(shipped, on=same, suffixes=("", "_shipped"), validate="1:1")
+    if len(both) < len(rows):
+        raise ValueError(f"{len(rows) - len(both)} of {len(rows)} rows are not among the shipped")
+    return both.assign(difference=(both["value"] - both["value_shipped"]).abs())
+
+
+def by_update(both: pd.DataFrame) -> pd.DataFrame:
+    """What :func:`beside` found on learning curves of :data:`MAIN`: by arm and number of frames.
+
+    Means over runs, shipped and live, and the largest difference of any run.
+    """
+    columns = {}
+    groups = both.groupby(["domain", "method", "frames"], sort=False)
+    means = groups[["value_shipped", "value"]].mean()
+    for color in both["domain"].unique():
+        columns[f"{color}, shipped"] = means.loc[color]["value_shipped"]
+        columns[f"{color}, live"] = means.loc[color]["value"]
+    by_arm = both.groupby(["method", "frames"], sort=False)
+    columns["largest difference"] = by_arm["difference"].max()
+    return pd.DataFrame(columns).rename(index=MAIN).rename_axis(["arm", "frames"]).reset_index()
+
+
+def gap(rows: pd.DataFrame, method: str, baseline: str, rng: np.random.Generator) -> str:
+    """Difference of the exact returns on grey, paired by run, with its 95 % interval, in words."""
+    mean, low, high = paired_difference(*_on_grey(rows, method, baseline), rng)
+    return f"{mean:+.3f} [{low:+.3f}, {high:+.3f}]"
+
+
+def comparison(
+    rows: pd.DataFrame, pairs: Sequence[tuple[str, str]], rng: np.random.Generator
+) -> pd.DataFrame:
+    """Exact returns on grey of pairs of arms: a row for each method and its baseline."""
+
+    def row(method: str, baseline: str) -> dict[str, Any]:
+        values, base = _on_grey(rows, method, baseline)
+        mean, low, high = paired_difference(values, base, rng)
+        return {
+            "difference on grey": f"{MAIN[method]} − {MAIN[baseline]}",
+            "mean": mean,
+            "95 % interval": f"[{low:+.3f}, {high:+.3f}]",
+            # The function is for costs, where less is better.
+            "P(improvement)": probability_of_improvement(-values, -base),
+            "p (Welch)": scipy.stats.ttest_ind(values, base, equal_var=False).pvalue,
+        }
+
+    return pd.DataFrame([row(*pair) for pair in pairs])
+
+
+def _on_grey(rows: pd.DataFrame, *methods: str, metric: str = "return_exact") -> list[pd.Series]:
+    """Values of all runs of some arms in the test domain."""
+    return [runs_of(rows, method, TESTED, metric) for method in methods]
+
+
+def draws_of_ten(
+    rows: pd.DataFrame, rng: np.random.Generator, num_draws: int = 100_000
+) -> dict[str, np.ndarray]:
+    """Experiments of the paper's size: ten of our runs ``[num_draws, 10]`` of IPO and of PPO.
+
+    Their returns on grey by the published protocol; a run may be drawn more than once.
+    """
+    drawn = {}
+    for method in ("ipo", "ppo"):
+        values = runs_of(rows, method, TESTED, "return_published_protocol").to_numpy()
+        drawn[method] = values[rng.integers(len(values), size=(num_draws, 10))]
+    return drawn
+
+
+def runs_needed(rows: pd.DataFrame, difference: float) -> int:
+    """Runs of IPO and of PPO that find such a difference on grey with a power of 80 % at 5 %.
+
+    n = 2 s^2 ((z_0.975 + z_0.8) / difference)^2,    s^2: variance over runs, mean of both arms
+    """
+    variance = np.mean([values.var() for values in _on_grey(rows, "ipo", "ppo")])
+    z = scipy.stats.norm.ppf([0.975, 0.8]).sum()
+    return int(np.ceil(2 * variance * (z / difference) ** 2))
+
+
+def p_of_spreads(rows: pd.DataFrame, metric: str) -> float:
+    """Brown-Forsythe test of whether IPO and PPO vary equally on grey."""
+    pair = _on_grey(rows, "ipo", "ppo", metric=metric)
+    return scipy.stats.levene(*pair, center="median").pvalue
+
+
+def encodings(
+    main: pd.DataFrame, variants: pd.DataFrame
+) -> dict[str, tuple[pd.DataFrame, tuple[str, ...]]]:
+    """What networks see of colours: rows and training colours by encoding.
+
+    The rows have the ``code`` of their domain's colour, and arms go by their plain names.
+    """
+
+    def by_code(rows: pd.DataFrame) -> pd.DataFrame:
+        code = [COLORS.index(color) for color in rows["domain"]]
+        return rows.assign(code=code, method=rows["method"].str.replace("_inside", ""))
+
+    def encoded(name: str) -> pd.DataFrame:
+        return by_code(variants[variants["color_encoding"] == name])
+
+    inside = variants[variants["train_colors"] == "red+yellow"]
+    return {
+        "integer, red and green": (by_code(main), TRAINED),
+        "integer, red and yellow": (by_code(inside), ("red", "yellow")),
+        "one-hot, red and green": (encoded("one_hot"), TRAINED),
+        "no colour, red and green": (encoded("none"), TRAINED),
+    }
+
+
+STEPS = {
+    "reaches_key": "holds the key",
+    "unlocks_door": "unlocks the door",
+    "success": "reaches the goal",
+}
+
+
+def subtasks(rows: pd.DataFrame) -> pd.DataFrame:
+    """Probability of each step of the task on red and on grey, by arm: the mean over runs."""
+    colors = ("red", TESTED)
+    chosen = rows[rows["metric"].isin(STEPS) & rows["domain"].isin(colors)]
+    means = chosen.groupby(["method", "domain", "metric"])["value"].mean().unstack()
+    order = list(itertools.product(MAIN, colors))
+    return means.loc[order, list(STEPS)].rename(columns=STEPS)
+
+
+# --------------------------------------------------------------------- read off saved policies
+
+
+def beyond_codes(
+    task: Keys,
+    saved: Mapping[str, Sequence[Weights]],
+    walls: Sequence[int],
+    codes: Sequence[int],
+) -> pd.DataFrame:
+    """Exact returns in the grey domain where key and door, and walls, are seen in other codes."""
+    table = task.tasks[TESTED]
+
+    def policy(players: Sequence[Weights], **kinds: int) -> np.ndarray:
+        return task.logits(players, recolor(table.images, kinds)).softmax(-1).numpy()
+
+    parts = []
+    for (method, players), wall in itertools.product(saved.items(), walls):
+        policies = [policy(players, key=code, door=code, wall=wall) for code in codes]
+        for code, values in zip(codes, _returns_of(table, policies), strict=True):
+            parts.append(_by_run(values, method=method, wall=wall, code=code))
+    return pd.concat(parts)
+
+
+def by_temperature(
+    task: Keys,
+    saved: Mapping[str, Sequence[Weights]],
+    colors: Sequence[str],
+    temperatures: Sequence[float],
+) -> pd.DataFrame:
+    """Exact returns where scores are divided by a temperature; at 0 the best action is taken."""
+
+    def policy(logits: np.ndarray, temperature: float) -> np.ndarray:
+        if temperature == 0:
+            return np.eye(logits.shape[-1])[logits.argmax(-1)]
+        return scipy.special.softmax(logits / temperature, axis=-1)
+
+    parts = []
+    for (method, players), color in itertools.product(saved.items(), colors):
+        table = task.tasks[color]
+        logits = task.logits(players, table.images).numpy()
+        policies = [policy(logits, temperature) for temperature in temperatures]
+        for temperature, values in zip(temperatures, _returns_of(table, policies), strict=True):
+            parts.append(_by_run(values, method=method, domain=color, temperature=temperature))
+    return pd.concat(parts)
+
+
+def _returns_of(table: TabularTask, policies: Sequence[np.ndarray]) -> np.ndarray:
+    """Exact returns ``[len(policies), R]`` of policies ``[R, K, A]``, all at once."""
+    return expected_return(table, np.concatenate(policies))[0].reshape(len(policies), -1)
+
+
+def _by_run(values: np.ndarray, **columns: Any) -> pd.DataFrame:
+    """Exact returns ``[R]`` as rows."""
+    runs = range(len(values))
+    return pd.DataFrame({**columns, "run": runs, "metric": "return_exact", "value": values})
+
+
+PHASES = ("searching the key", "with the key", "door unlocked")
+
+
+def visits(task: Keys, players: Sequence[Weights], color: str) -> np.ndarray:
+    """Expected steps ``[phase, row, column]`` in each cell of the grid, mean over runs."""
+    table = task.tasks[color]
+    spent = occupancy(table, task.policy(players, color)).mean(0)
+    size = table.position.max() + 2  # the outer wall is not stood on
+    grid = np.zeros((len(PHASES), size, size))
+    np.add.at(grid, (table.progress, table.position[:, 1], table.position[:, 0]), spent)
+    return grid

@@ -6,6 +6,7 @@ import base64
 import html
 import importlib
 import io
+import itertools
 import weakref
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -21,6 +22,7 @@ from matplotlib.figure import Figure
 
 from ipo.checks import check_choice
 from ipo.worlds.door import DoorParams, build_door, shift_handle
+from ipo.worlds.tabular import TabularTask, state_of
 
 
 def record(
@@ -35,6 +37,14 @@ def record(
         if terminated or truncated:
             break
     return frames
+
+
+def record_on_table(
+    env: Env, table: TabularTask, act: Callable[[int, int], int], seed: int
+) -> list[np.ndarray]:
+    """:func:`record` of ``act(step, state) -> action``, where the table counts the states."""
+    steps = itertools.count()
+    return record(env, lambda _: int(act(next(steps), state_of(table, env))), seed)
 
 
 def film_strip(
@@ -54,6 +64,19 @@ def film_strip(
         line[0].text(
             -0.12, 0.5, title, transform=line[0].transAxes, rotation=90, ha="center", va="center"
         )
+    return fig
+
+
+def titled(
+    pictures: Sequence[tuple[str, np.ndarray]], num_rows: int, size: tuple[float, float]
+) -> Figure:
+    """Pictures with their titles, in rows of the same length."""
+    fig, axes = plt.subplots(num_rows, -(-len(pictures) // num_rows), figsize=size, squeeze=False)
+    for ax in axes.flat:
+        ax.axis("off")
+    for ax, (title, picture) in zip(axes.flat, pictures, strict=False):
+        ax.imshow(picture)
+        ax.set_title(title, fontsize=9)
     return fig
 
 
@@ -133,7 +156,7 @@ class DoorPicture:
         ]
         self.follows = camera == "handle"
 
-    def frame(self, qpos: np.ndarray, handle_shift: np.ndarray = (0.0, 0.0)) -> np.ndarray:
+    def frame(self, qpos: np.ndarray, handle_shift: np.ndarray) -> np.ndarray:
         """A picture ``[height, width, 3]`` of the joints ``[7]``."""
         shift_handle(self.model, self.params, handle_shift)
         self.data.qpos[:] = qpos
@@ -155,6 +178,27 @@ class RenderError(RuntimeError):
     """No pictures can be drawn on this machine."""
 
 
+class Blank:
+    """What stands where a door cannot be drawn."""
+
+    def __init__(self, width: int, height: int) -> None:
+        self.picture = np.full((height, width, 3), 220, np.uint8)
+
+    def frame(self, *_: Any) -> np.ndarray:
+        return self.picture
+
+
+def camera(
+    params: DoorParams, view: str = "handle", width: int = 240, height: int = 180
+) -> DoorPicture | Blank:
+    """Draws a door; without OpenGL, says what to install and goes on without pictures."""
+    try:
+        return DoorPicture(params, width, height, view)
+    except RenderError as error:
+        print(error)
+        return Blank(width, height)
+
+
 def _free(context: Any, opengl: mujoco.MjrContext) -> None:
     """Give the memory of OpenGL back: its numbers only mean something in their own context."""
     context.make_current()
@@ -166,7 +210,7 @@ def door_scene(params: DoorParams, width: int = 640, height: int = 480) -> mujoc
     """:func:`ipo.worlds.door.build_door` with paint, light, frame, wall and floor, for pictures."""
     spec = build_door(params)
     spec.visual.global_.offwidth, spec.visual.global_.offheight = width, height
-    spec.visual.quality.shadowsize, spec.visual.quality.offsamples = 4096, 8
+    spec.visual.quality.shadowsize, spec.visual.quality.offsamples = 2048, 8
     spec.visual.headlight.ambient, spec.visual.headlight.diffuse = [0.38] * 3, [0.25] * 3
     spec.visual.headlight.specular = [0.05] * 3
     spec.visual.map.znear, spec.visual.map.zfar = 0.01, 30

@@ -17,7 +17,7 @@ from experiments import keys
 from experiments.experiment import Experiment
 from experiments.keys import Keys, encode
 from experiments.rows import tidy
-from ipo.networks import OnTable, Weights
+from ipo.networks import OnTable, Weights, copied
 from ipo.ppo import Training
 from ipo.worlds.tabular import TabularDomains, expected_return, optimal_policy
 
@@ -58,8 +58,8 @@ def run_players(cell: Cell, seeds: list[int], tables: str | Path) -> pd.DataFram
     task = Keys(tables, trained.color_encoding, trained.size)
     domains = TabularDomains([task.tasks[color] for color in colors])
     network = OnTable(task.network, encode(domains.images, trained.color_encoding))
-    training = Training(network, task.network.start, domains, len(colors), trained.settings, seeds)
-    start = copy.deepcopy(training.players)
+    training = Training(network, domains, len(colors), trained.settings, seeds)
+    start = copied(training.players)
     scores_at_start = [_scores(task, player, colors) for player in start]
     best = [optimal_policy(task.tasks[color])[1] for color in colors]
     parts = []
@@ -92,13 +92,18 @@ def run_players(cell: Cell, seeds: list[int], tables: str | Path) -> pd.DataFram
 
 
 def _alone(training: Training, d: int, num_updates: int) -> list[Weights]:
-    """The players after player d has gone on for some updates while the others stood still."""
+    """The players after player d has gone on for some updates while the others stood still.
+
+    They take their turns all the same, and what they have learnt is taken back: all players draw
+    from the same random streams, so what d sees depends on how much the others have drawn.
+    """
     training = copy.deepcopy(training)
-    for e, optimizer in enumerate(training.optimizers):
-        if e != d:
-            optimizer.param_groups[0]["lr"] = 0.0
     for _ in range(num_updates):
-        training.update()
+        for e in range(len(training.players)):
+            before = copied(training.players)
+            training.update(only=e)
+            if e != d:
+                training.set_players(before)
     return training.players
 
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from experiments import algorithm, causality, door, keys, lqr, own_domains
 from experiments.experiment import Experiment, Places
 from experiments.origin import ROOT
+from ipo.checks import check_choice
 
 DATA = ROOT / "data"
 CHAPTERS: dict[str, dict[str, Experiment]] = {
@@ -17,6 +19,19 @@ CHAPTERS: dict[str, dict[str, Experiment]] = {
     "door": door.EXPERIMENTS,
     "your_own_domains": own_domains.EXPERIMENTS,
 }
+
+
+def chosen(names: Sequence[str]) -> list[tuple[str, str]]:
+    """Chapter and name of every experiment that ``lqr`` or ``lqr/tables`` names; of none: all.
+
+    Raises:
+        ValueError: a name that is none of them.
+    """
+    every = [(chapter, name) for chapter, own in CHAPTERS.items() for name in own]
+    known = {*CHAPTERS, *map("/".join, every)}
+    for name in names:
+        check_choice("experiment", name, sorted(known))
+    return [pair for pair in every if not names or pair[0] in names or "/".join(pair) in names]
 
 
 def again(chapter: str, name: str, scratch: Path) -> Experiment:

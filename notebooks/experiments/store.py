@@ -70,8 +70,12 @@ class Store:
         return self._read()[0]
 
     def batches(self) -> list[Batch]:
-        """The origin of every batch, as recorded when it was computed."""
-        return self._read()[1]
+        """The origin of every batch, as recorded when it was computed; rows are not looked at.
+
+        Raises:
+            ResultsError: a record that cannot be read, or rows without one.
+        """
+        return self._record()[1]
 
     def rows_of(self, batch: Batch) -> pd.DataFrame:
         """The rows of one batch."""
@@ -125,20 +129,10 @@ class Store:
 
     def _read(self) -> tuple[pd.DataFrame, list[Batch]]:
         """Rows and batches, every batch checked against its rows."""
-        if not self.json.exists():
-            if self.csv.exists():
-                raise ResultsError(
-                    f"{self.csv}: has no {self.json.name} beside it that says where it comes from"
-                )
+        types, batches = self._record()
+        if not batches:  # or killed before the first batch was saved whole
             return NO_ROWS, []
         try:
-            record = json.loads(self.json.read_text(encoding="utf-8"))
-            types, batches = dict(record["types"]), list(record["batches"])
-            for batch in batches:
-                if absent := KEYS - batch.keys():
-                    raise KeyError(f"a batch without {min(absent)}")
-            if not batches:  # killed before the first batch was saved whole
-                return NO_ROWS, []
             columns = pd.read_csv(self.csv, nrows=0).columns
             if absent := [column for column in types if column not in columns]:
                 raise ResultsError(
@@ -147,12 +141,30 @@ class Store:
             rows = pd.read_csv(self.csv, dtype=types, keep_default_na=False)
         except ResultsError:
             raise
-        except (ValueError, KeyError, TypeError, AttributeError, OSError) as error:
+        except (ValueError, OSError) as error:
             raise ResultsError(f"{self.json.with_suffix('')}: cannot be read: {error}") from error
         # Rows that no batch claims: the run was killed between the two renames. They are
         # computed again.
         parts = [self._checked(rows, batch) for batch in batches]
         return pd.concat(parts, ignore_index=True), batches
+
+    def _record(self) -> tuple[dict[str, str], list[Batch]]:
+        """The types of the columns, and the batches."""
+        if not self.json.exists():
+            if self.csv.exists():
+                raise ResultsError(
+                    f"{self.csv}: has no {self.json.name} beside it that says where it comes from"
+                )
+            return {}, []
+        try:
+            record = json.loads(self.json.read_text(encoding="utf-8"))
+            types, batches = dict(record["types"]), list(record["batches"])
+            for batch in batches:
+                if absent := KEYS - batch.keys():
+                    raise KeyError(f"a batch without {min(absent)}")
+        except (ValueError, KeyError, TypeError, AttributeError, OSError) as error:
+            raise ResultsError(f"{self.json.with_suffix('')}: cannot be read: {error}") from error
+        return types, batches
 
     def _checked(self, rows: pd.DataFrame, batch: Batch) -> pd.DataFrame:
         part = select(rows[rows["run"].isin(batch["seeds"])], batch["columns"])

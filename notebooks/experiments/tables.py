@@ -41,6 +41,22 @@ def costs(folder: str | Path, names: Sequence[str]) -> Styler:
     return show(pd.DataFrame(map(row, names)), {"CPU minutes": "{:.1f}"})
 
 
+def beside_shipped(live: pd.DataFrame, shipped: pd.DataFrame) -> pd.DataFrame:
+    """Live rows with the shipped ones of the same keys, and how far they are apart.
+
+    Raises:
+        ValueError: a live row of which none is shipped.
+    """
+    keys = [column for column in live.columns if column != "value"]
+    both = live.rename(columns={"value": "live"}).merge(
+        shipped.rename(columns={"value": "shipped"}), on=keys, how="left", validate="one_to_one"
+    )
+    if both["shipped"].isna().any():
+        first = both.loc[both["shipped"].isna(), keys].iloc[0].to_dict()
+        raise ValueError(f"shipped: has no row for {first}, must have one for each live row")
+    return both.assign(**{"relative difference": (both["live"] / both["shipped"] - 1).abs()})
+
+
 def mean_and_interval(values: pd.Series, digits: int = 2) -> str:
     """Of runs, with the 95 % interval of the mean."""
     low, high = bootstrap_interval(values.to_numpy(), np.random.default_rng(0))

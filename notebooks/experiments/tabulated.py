@@ -13,7 +13,7 @@ import numpy as np
 from filelock import FileLock
 from gymnasium import Env
 
-from ipo.worlds.tabular import TabularTask, state_of, tabulate
+from ipo.worlds.tabular import TabularTask, goal_reward, state_of, tabulate
 
 NUM_STEPS = 200  # of random episodes in which a table and its environment are compared
 
@@ -35,9 +35,11 @@ def load_or_tabulate(make_env: Callable[..., Env], folder: str | Path, **options
 
 
 def agrees(task: TabularTask, env: Env) -> bool:
-    """Whether a table says what the environment does, in some hundred random steps."""
-    env, generator = env.unwrapped, np.random.default_rng(0)
-    ended, step = True, 0
+    """Whether a table knows what the goal is worth, and what some hundred random steps do."""
+    env = env.unwrapped
+    if not np.array_equal(task.goal_reward, goal_reward(env)):
+        return False
+    generator, ended, step = np.random.default_rng(0), True, 0
     for _ in range(NUM_STEPS):
         if ended:
             observation, step = env.reset(seed=int(generator.integers(2**31)))[0], 0

@@ -1,17 +1,15 @@
-"""Speed of the doors: simulation, one update of PPO and of IPO, memory, two processes.
+"""Speed of the doors: simulation, one update of PPO and of IPO, memory.
 
     python tests/bench/bench_door.py [--blocks 6] [--steps 60] [--json PATH]
 
 CPU time is compared in short blocks that take turns, so that a busy machine slows all alike. What
-training needs is the published settings' rollout and updates, measured once and multiplied; the
-wall time of one and two workers is only worth something on a machine that is otherwise idle.
+training needs is the published settings' rollout and updates, measured once and multiplied.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import os
 import resource
 import statistics
 import time
@@ -22,9 +20,8 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from experiments.door_training import NETWORK, TRAIN_FRICTIONS, make_doors, published
-from ipo.ppo import Training, improve
-from ipo.rollouts import collect
+from experiments.door_training import NETWORK, new_training, published_door
+from experiments.files import replace_text
 from ipo.worlds.door import DoorEnv
 from ipo.worlds.many_doors import VectorDoor
 
@@ -95,54 +92,17 @@ def simulation(num_steps: int, num_blocks: int) -> dict[str, list[float]]:
 
 def update_costs(method: str) -> dict[str, float]:
     """CPU seconds of a published update: simulation, and what learning costs."""
-    settings = published(method)
-    training = Training(NETWORK, NETWORK.start, make_doors, len(TRAIN_FRICTIONS), settings, [0])
+    training = new_training(published_door(method), seed=0)
     costs = {"simulation": 0.0, "learning": 0.0}
-    for d in range(len(training.players)):
-        found = []
-        costs["simulation"] += cpu_seconds(
-            lambda d=d, found=found: found.append(
-                collect(
-                    NETWORK.frozen(training.players),
-                    NETWORK.distribution,
-                    training.environments[d],
-                    training.observations[d],
-                    settings.num_steps,
-                    training.draws,
-                    training.normalizers[d],
-                    settings.discount,
-                    settings.gae_lambda,
-                    settings.time_outs,
-                )
-            )
-        )
-        frames = found[0][0].frames()
-        costs["learning"] += cpu_seconds(
-            lambda d=d, frames=frames: improve(
-                NETWORK,
-                training.players,
-                d,
-                training.optimizers[d],
-                frames,
-                settings,
-                training.orders,
-            )
-        )
+    for d, collector in enumerate(training.collectors):
+        average = NETWORK.frozen(training.players)
+        start = time.process_time()
+        rollout = collector.collect(average, NETWORK.distribution, training.draws)
+        collected = time.process_time()
+        training.improve(d, rollout.frames())
+        costs["simulation"] += collected - start
+        costs["learning"] += time.process_time() - collected
     return costs
-
-
-def wall_speed(num_workers: int, num_steps: int) -> float:
-    """Steps of 256 doors per second of the clock."""
-    doors = VectorDoor([0.0] * 256, num_workers=num_workers)
-    doors.reset(seed=0)
-    actions = np.random.default_rng(0).normal(size=(num_steps, 256, 6))
-    doors.step(actions[0])
-    before = time.perf_counter()
-    for action in actions:
-        doors.step(action)
-    speed = num_steps * 256 / (time.perf_counter() - before)
-    doors.close()
-    return speed
 
 
 def main() -> None:
@@ -170,16 +130,9 @@ def main() -> None:
         print(f"  {method:32}{sum(minutes.values()):12.1f}   ({text})")
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     print(f"Memory at its peak: {memory:.2f} GiB")
-    workers = {number: wall_speed(number, options.steps) for number in (1, 2)}
-    print(f"Steps per second of the clock, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}")
-    for number, value in workers.items():
-        print(f"  {number} workers {value:33,.1f}")
     if options.json:
         numbers = {"speeds": speeds, "update_cpu_seconds": costs, "memory_gib": memory}
-        text = json.dumps(numbers | {"workers": workers}, indent=1) + "\n"
-        temporary = options.json.with_name(f"{options.json.name}.tmp")
-        temporary.write_text(text)
-        os.replace(temporary, options.json)
+        replace_text(options.json, json.dumps(numbers, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -26,8 +26,8 @@ import torch
 from minigrid.wrappers import ImgObsWrapper
 from tqdm import tqdm
 
-from experiments.keys import Cell, Keys
-from ipo.ppo import published
+from experiments.files import replace_text
+from experiments.keys import Cell, Keys, published
 from ipo.worlds.colored_keys import ColoredKeysEnv
 from ipo.worlds.tabular import expected_return, tabulate
 
@@ -151,7 +151,7 @@ def main() -> None:
         print(f"{name:48}" + "".join(f"{value:9.2f}" for value in row.values()) + goal)
     if options.json:
         content = {"updates": options.updates, "goals": GOALS, "rows": rows}
-        options.json.write_text(json.dumps(content, indent=1) + "\n")
+        replace_text(options.json, json.dumps(content, indent=1) + "\n")
 
 
 if __name__ == "__main__":

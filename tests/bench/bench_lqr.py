@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import statistics
 import sys
 import time
@@ -23,9 +22,10 @@ from pathlib import Path
 import torch
 from tqdm import tqdm
 
-from ipo.game import new_players, split_players
+from experiments.files import replace_text
+from ipo.game import LinearPlayers
 from ipo.lqr import sample_problem
-from ipo.lqr_learners import METHODS, published, train, trained_gain
+from ipo.lqr_learners import LQR_METHODS, published_lqr, train
 from ipo.optimizers import make_optimizer
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -51,7 +51,7 @@ def cpu_ms(work: Callable[[], object], num_iterations: int, num_threads: int = 1
 
 def training(method: str, block: int) -> Iterator:
     """Of ten seeds; every ``next`` trains for ``block`` iterations."""
-    problem, settings = sample_problem(SEEDS, **SIZES), published(method)
+    problem, settings = sample_problem(SEEDS, **SIZES), published_lqr(method)
     reports = train(problem, settings, SEEDS, checkpoints=range(0, 5000, block))
     next(reports)  # the start
     return reports
@@ -59,8 +59,10 @@ def training(method: str, block: int) -> Iterator:
 
 def largest_difference() -> float:
     """Between the controllers that the two implementations learn."""
-    settings = replace(published("ipo_fixed_phi"), num_iterations=NUM_COMPARED)
-    fast = trained_gain(sample_problem([0], **SIZES, dtype=torch.float64), settings, [0])[0]
+    settings = replace(published_lqr("ipo_fixed_phi"), num_iterations=NUM_COMPARED)
+    problem = sample_problem([0], **SIZES, dtype=torch.float64)
+    *_, (_, gain) = train(problem, settings, [0])
+    fast = gain[0]
     A, Ws, _ = straightforward.problem(0, **SIZES, dtype=torch.float64)
     slow = straightforward.ipo_fixed_phi(A, Ws, NUM_COMPARED, settings.learning_rate)
     return float((fast - slow).abs().max() / slow.abs().max())
@@ -87,7 +89,7 @@ def compare(block: int, num_blocks: int) -> dict[str, list[float]]:
 def methods(block: int, num_blocks: int) -> dict[str, list[float]]:
     """Milliseconds of an iteration of ten seeds, one thread, by method."""
     columns = {}
-    for method in tqdm(METHODS, desc="methods", unit="method"):
+    for method in tqdm(LQR_METHODS, desc="methods", unit="method"):
         reports = training(method, block)
         times = [cpu_ms(lambda reports=reports: next(reports), block) for _ in range(num_blocks)]
         columns[f"{method} [ms]"] = times
@@ -97,23 +99,17 @@ def methods(block: int, num_blocks: int) -> dict[str, list[float]]:
 def adam_alone(block: int, num_blocks: int) -> dict[str, list[float]]:
     """Milliseconds of all players' Adam steps without a cost or a gradient: the lower bound."""
     problem = sample_problem(SEEDS, **SIZES)
-    players = split_players(new_players(len(SEEDS), problem.num_domains, problem.gain_shape))
-    optimizers = [make_optimizer("adam", [player], learning_rate=5e-4) for player in players]
-    for player in players:
+    starts = torch.zeros(len(SEEDS), problem.num_domains, *problem.gain_shape)
+    game = LinearPlayers(starts, lambda player: make_optimizer("adam", player, 5e-4))
+    for player in game.players:
         player.grad = torch.ones_like(player)
 
     def update() -> None:
         for _ in range(block):
-            for optimizer in optimizers:
+            for optimizer in game.optimizers:
                 optimizer.step()
 
     return {"Adam alone, ipo_fixed_phi [ms]": [cpu_ms(update, block) for _ in range(num_blocks)]}
-
-
-def write(path: Path, content: dict) -> None:
-    temporary = path.with_name(f"{path.name}.tmp")
-    temporary.write_text(json.dumps(content, indent=1) + "\n")
-    os.replace(temporary, path)
 
 
 def main() -> None:
@@ -140,7 +136,8 @@ def main() -> None:
     for name, row in rows.items():
         print(f"{name:46}" + "".join(f"{value:10.1f}" for value in row.values()))
     if options.json:
-        write(options.json, {"relative_difference": difference, "rows": rows})
+        numbers = {"relative_difference": difference, "rows": rows}
+        replace_text(options.json, json.dumps(numbers, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -13,13 +13,15 @@ from ipo import game, lqr_learners, ppo
 @pytest.mark.parametrize(
     "function",
     [
+        game.domains_of_players,
+        game.play_round,
         game.average,
-        game.best_response_round,
+        game.LinearPlayers._move_in_turn,
         lqr_learners.ipo_fixed_phi,
         lqr_learners.ipo_variable_phi,
-        ppo.Settings.domains_of_players,
         ppo.Training.update,
-        ppo.improve,
+        ppo.Training.respond,
+        ppo.Training.improve,
     ],
     ids=lambda function: function.__qualname__,
 )

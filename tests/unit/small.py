@@ -8,6 +8,7 @@ from plain_ppo import ActorCritic
 from torch import Tensor
 
 from ipo.lqr import LQR, sample_problem
+from ipo.lqr_learners import LQRSettings, train
 from ipo.networks import GridNetwork, Outputs, Weights
 
 
@@ -56,6 +57,14 @@ def random_gain(problem: LQR, seed: int = 0) -> Tensor:
     K = torch.randn(shape, generator=generator, dtype=torch.float64)
     shown = torch.cat([problem.seen, problem.W_test], dim=-1)
     return K * (1 - _norm(problem.A)) / 2 / (_norm(problem.B) * _norm(K) * _norm(shown))
+
+
+def trained_gain(
+    problem: LQR, settings: LQRSettings, seeds: Sequence[int], start: Tensor | None = None
+) -> Tensor:
+    """The controllers ``[R, n_u, n_o]`` that training ends with."""
+    *_, (_, gain) = train(problem, settings, seeds, start)
+    return gain
 
 
 def _norm(matrix: Tensor) -> Tensor:

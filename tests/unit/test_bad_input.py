@@ -9,13 +9,14 @@ import re
 import numpy as np
 import pytest
 import torch
-from small import paper_problem
+from small import paper_problem, trained_gain
 
+from experiments.experiment import Experiment
 from experiments.lqr import Cell, run_cell
-from experiments.store import run_or_load
+from experiments.store import Store
 from ipo.checks import check_notebook_parameters
 from ipo.lqr import sample_problem, simulate
-from ipo.lqr_learners import Settings, published, trained_gain
+from ipo.lqr_learners import LQRSettings, published_lqr
 from ipo.optimizers import make_optimizer
 from ipo.stats import bootstrap_interval, paired_difference, probability_of_improvement
 
@@ -127,17 +128,17 @@ def test_steps_of_a_simulation():
 )
 def test_settings_that_make_no_sense(name, value, error, rule):
     with pytest.raises(error, match=named(name, value, rule)):
-        Settings(**({"method": "ipo_fixed_phi"} | {name: value}))
+        LQRSettings(**({"method": "ipo_fixed_phi"} | {name: value}))
 
 
 def test_misspelt_setting():
     with pytest.raises(TypeError, match="learning_rat"):
-        Settings("ipo_fixed_phi", learning_rat=1e-3)
+        LQRSettings("ipo_fixed_phi", learning_rat=1e-3)
 
 
 def test_published_settings_of_an_unknown_method():
     with pytest.raises(ValueError, match=named("method", "ipo", "must be one of gradient_descent")):
-        published("ipo")
+        published_lqr("ipo")
 
 
 @pytest.mark.parametrize(
@@ -174,7 +175,7 @@ def start_of(*shape: int, fill: float = 0.0) -> torch.Tensor:
 )
 def test_training_that_cannot_begin(options, message):
     with pytest.raises(ValueError, match=message):
-        trained_gain(paper_problem(), Settings("ipo_fixed_phi"), **({"seeds": [0, 1]} | options))
+        trained_gain(paper_problem(), LQRSettings("ipo_fixed_phi"), **({"seeds": [0, 1]} | options))
 
 
 @pytest.mark.parametrize("method", ["gradient_descent", "ipo_fixed_phi"])
@@ -185,17 +186,17 @@ def test_unstable_start(method):
     start[1, :, :4] = (1 - 1.25 / 0.8) * problem.A[1] @ torch.linalg.inv(problem.seen[1, :4, :4])
     message = r"^start: .* run 1 in training domain 0 has spectral radius 1\.2500, must be below 1"
     with pytest.raises(ValueError, match=message):
-        trained_gain(problem, Settings(method), [0, 1], start=start)
+        trained_gain(problem, LQRSettings(method), [0, 1], start=start)
 
 
 def test_marginal_start():
     """The paper's text, with an orthogonal A, taken literally."""
     with pytest.raises(ValueError, match=r"spectral radius 1\.0000, must be below 1"):
-        trained_gain(paper_problem(contraction=1.0), Settings("gradient_descent"), [0, 1])
+        trained_gain(paper_problem(contraction=1.0), LQRSettings("gradient_descent"), [0, 1])
 
 
 def test_unstable_random_layers():
-    chosen = Settings("overparameterized", phi_scale=10.0, gain_scale=10.0)
+    chosen = LQRSettings("overparameterized", phi_scale=10.0, gain_scale=10.0)
     with pytest.raises(ValueError, match=r"spectral radius \d+\.\d{4}, must be below 1"):
         trained_gain(paper_problem(), chosen, [0, 1])
 
@@ -203,11 +204,11 @@ def test_unstable_random_layers():
 @pytest.mark.parametrize("method", ["overparameterized", "ipo_variable_phi"])
 def test_start_for_a_method_with_layers(method):
     with pytest.raises(ValueError, match=f"^start: {method} starts from random layers"):
-        trained_gain(paper_problem(), Settings(method), [0, 1], start=start_of(2, 4, 10))
+        trained_gain(paper_problem(), LQRSettings(method), [0, 1], start=start_of(2, 4, 10))
 
 
 def test_early_stopping_without_a_domain_to_hold_out():
-    cell = Cell("gradient_descent", 1, 20, Settings("gradient_descent"), early_stopping=True)
+    cell = Cell("gradient_descent", 1, 20, LQRSettings("gradient_descent"), early_stopping=True)
     with pytest.raises(ValueError, match=r"^num_domains = 1: must be at least 2"):
         run_cell(cell, [0])
 
@@ -231,20 +232,6 @@ def test_runs_without_an_interval(values, message):
         bootstrap_interval(values, rng)
     with pytest.raises(ValueError, match=message):
         paired_difference(values, [1.0, 2.0], rng)
-
-
-@pytest.mark.parametrize(
-    ("level", "rule"),
-    [
-        (0.0, "must be greater than 0"),
-        (1.0, "must be below 1"),
-        (95, "must be below 1"),
-        (NAN, "must not be NaN"),
-    ],
-)
-def test_level_that_is_no_probability(level, rule):
-    with pytest.raises(ValueError, match=named("level", level, rule)):
-        bootstrap_interval([1.0, 2.0], np.random.default_rng(0), level=level)
 
 
 def test_runs_without_a_partner():
@@ -301,5 +288,5 @@ def test_results_without_proper_seeds(tmp_path, seeds, message):
 
     cell = Cell("oracle", 2, 20, None)
     with pytest.raises(ValueError, match=message):
-        run_or_load(tmp_path / "new", "rows", [cell], seeds, run, ["stats"])
+        Store(tmp_path / "new", "rows").fill(Experiment(run, Cell), [cell], seeds)
     assert list(tmp_path.iterdir()) == []

@@ -17,11 +17,12 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from test_bad_input import INF, LEAST_1, NAN, WHOLE, named
 
 import ipo  # noqa: F401  (registers the environment)
-from experiments.keys import Cell, encode, run_cell
+from experiments.keys import Cell, encode, published, run_cell
+from experiments.policies import load_policy, save_policy
 from experiments.tabulated import load_or_tabulate
-from ipo.networks import GridNetwork, Weights, load_policy, save_policy
-from ipo.ppo import Settings, published, train
-from ipo.vector_environments import FromGymnasium
+from ipo.networks import GridNetwork, Weights
+from ipo.ppo import PPOSettings, Training
+from ipo.rollouts import FromGymnasium
 from ipo.worlds.colored_keys import ColoredKeysEnv
 from ipo.worlds.tabular import NotTabularError
 
@@ -119,7 +120,7 @@ def test_no_table_of_a_random_environment(tmp_path, monkeypatch):
     ],
 )
 def test_settings_that_make_no_sense(name, value, error, rule):
-    for make in (Settings, published):
+    for make in (PPOSettings, published):
         with pytest.raises(error, match=named(name, value, rule)):
             make(**({"method": "ipo"} | {name: value}))
 
@@ -134,6 +135,16 @@ def test_misspelt_setting():
 
 def nothing_must_happen(*arguments: object) -> None:
     raise AssertionError("nothing must be drawn, made or trained")
+
+
+class NoNetwork(GridNetwork):
+    """Nobody asks for its weights."""
+
+    start = nothing_must_happen
+
+
+def begin(settings: PPOSettings, num_domains: int, seeds: object) -> Training:
+    return Training(NoNetwork(), nothing_must_happen, num_domains, settings, seeds)
 
 
 @pytest.mark.parametrize(
@@ -165,21 +176,14 @@ def nothing_must_happen(*arguments: object) -> None:
     ],
 )
 def test_training_that_cannot_begin(method, num_domains, changes, message):
-    settings = published(method, **changes)
-    reports = train(
-        GridNetwork(), nothing_must_happen, nothing_must_happen, num_domains, settings, [0]
-    )
     with pytest.raises(ValueError, match=message):
-        next(reports)
+        begin(published(method, **changes), num_domains, [0])
 
 
 @pytest.mark.parametrize("method", ["ppo", "ipo"])
 def test_training_without_a_domain(method):
-    reports = train(
-        GridNetwork(), nothing_must_happen, nothing_must_happen, 0, published(method), [0]
-    )
     with pytest.raises(ValueError, match=r"^num_domains = 0: must be at least 1"):
-        next(reports)
+        begin(published(method), 0, [0])
 
 
 @pytest.mark.parametrize(
@@ -193,11 +197,8 @@ def test_training_without_a_domain(method):
     ],
 )
 def test_seeds_that_are_none(seeds, message):
-    reports = train(
-        GridNetwork(), nothing_must_happen, nothing_must_happen, 2, published("ppo"), seeds
-    )
     with pytest.raises((TypeError, ValueError), match=message):
-        next(reports)
+        begin(published("ppo"), 2, seeds)
 
 
 @pytest.mark.parametrize(

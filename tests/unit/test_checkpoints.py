@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from experiments import checkpoints, door_training
+from experiments import door_training
 from experiments.checkpoints import (
     CheckpointError,
     CheckpointWarning,
@@ -19,8 +19,8 @@ from experiments.checkpoints import (
     previous,
     save_checkpoint,
 )
-from experiments.door_training import NETWORK, Cell, Run, published, train_run
-from ipo.networks import load_policy
+from experiments.door_training import NETWORK, Cell, Run, published_door, train_run
+from experiments.policies import load_policy
 
 TREE = {
     "number": 3,
@@ -87,7 +87,7 @@ def test_a_full_disk_leaves_what_was_there(tmp_path, monkeypatch):
     def full(_):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(checkpoints.os, "fsync", full)
+    monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(CheckpointError, match=r"cannot be written \(No space left on device\)"):
         save_checkpoint(path, {"number": 2})
     assert load_checkpoint(path) == {"number": 1}
@@ -104,7 +104,7 @@ def few_doors(monkeypatch):
 
 def small(method: str = "ipo", num_updates: int = 3) -> Cell:
     """Rollouts that end in the middle of an episode."""
-    settings = published(
+    settings = published_door(
         method, num_updates=num_updates, num_envs=(2, 2), num_steps=530, num_minibatches=4
     )
     return Cell(method, settings, saved_after=(2, num_updates), curve_every=2)
@@ -142,8 +142,8 @@ def test_a_shorter_training_is_the_beginning_of_a_longer_one(tmp_path):
 
 def test_a_checkpoint_of_other_settings_is_refused(tmp_path):
     Run(small("ppo"), 0, tmp_path, tmp_path).update()
-    other = Cell("ppo", published("ppo", learning_rate=0.1, num_updates=3), saved_after=(3,))
-    with pytest.raises(CheckpointError, match="made by other code or settings; delete it"):
+    other = Cell("ppo", published_door("ppo", learning_rate=0.1, num_updates=3), saved_after=(3,))
+    with pytest.raises(CheckpointError, match="made with other settings; delete it"):
         Run(other, 0, tmp_path, tmp_path)
 
 
@@ -162,17 +162,17 @@ def test_the_best_policy_is_that_of_the_best_last_ten_episodes(tmp_path, monkeyp
 
 def test_policies_are_saved_within_the_training_only():
     with pytest.raises(ValueError, match=r"saved_after = \(95, 190\): must be between 1 and"):
-        Cell("ppo", published("ppo", num_updates=100))
+        Cell("ppo", published_door("ppo", num_updates=100))
 
 
 def test_kill_loses_one_update_at_most(tmp_path):
     script = tmp_path / "train.py"
     script.write_text(
         "import torch\n"
-        "from experiments.door_training import Cell, published, train_run\n"
+        "from experiments.door_training import Cell, published_door, train_run\n"
         "torch.set_num_threads(1)\n"
-        "settings = published('ppo', num_updates=50, num_envs=(1, 1), num_steps=512,\n"
-        "                     num_minibatches=2, num_epochs=1)\n"
+        "settings = published_door('ppo', num_updates=50, num_envs=(1, 1), num_steps=512,\n"
+        "                          num_minibatches=2, num_epochs=1)\n"
         "cell = Cell('ppo', settings, saved_after=(50,), curve_every=50)\n"
         f"train_run(cell, [0], {str(tmp_path / 'c')!r}, {str(tmp_path / 'p')!r})\n"
     )

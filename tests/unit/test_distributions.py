@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from scipy.stats import norm
 from torch import Tensor
 
-from ipo.dense_network import DenseNetwork
+from experiments.policies import load_policy, save_policy
 from ipo.distributions import Categorical, Gaussian
-from ipo.networks import load_policy, save_policy
+from ipo.networks import DenseNetwork
 
 
 def generators(*seeds: int) -> list[np.random.Generator]:

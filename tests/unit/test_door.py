@@ -1,11 +1,6 @@
 """The door: kinematics, dynamics and reward by hand, one door against many, bad input."""
 
 import math
-import os
-import signal
-import subprocess
-import sys
-import time
 from dataclasses import replace
 
 import gymnasium as gym
@@ -33,7 +28,7 @@ from ipo.worlds.door import (
     shift_handle,
     target_position,
 )
-from ipo.worlds.many_doors import VectorDoor, WorkerError
+from ipo.worlds.many_doors import VectorDoor
 
 NAN = math.nan
 
@@ -245,30 +240,27 @@ def test_an_episode_ends_at_the_time_limit_only():
     assert ends == [(False, False), (False, False), (False, True)]
 
 
-@pytest.mark.parametrize("num_workers", [0, 2])
-def test_many_doors_are_as_many_single_ones(num_workers):
+def test_many_doors_are_as_many_single_ones():
     frictions, seeds, steps = [0.0, 0.1, 1.3], [11, 12, 13], 12
     singles = [DoorEnv(friction, max_steps=steps) for friction in frictions]
-    with_workers = VectorDoor(frictions, num_workers=num_workers, max_steps=steps)
-    try:
-        observations, _ = with_workers.reset(seed=seeds)
-        for env, seed, row in zip(singles, seeds, observations, strict=True):
-            assert np.array_equal(env.reset(seed=seed)[0], row)
-        random = np.random.default_rng(0)
-        for _ in range(2 * steps + 3):
-            actions = 2 * random.normal(size=(3, 6))
-            found = with_workers.step(actions)
-            for d, env in enumerate(singles):
-                row, earned, _, truncated, info = env.step(actions[d])
-                assert (earned, truncated) == (found[1][d], found[3][d])
-                assert info["door_angle"] == found[4]["door_angle"][d]
-                if truncated:
-                    assert np.array_equal(row, found[4]["final_obs"][d])
-                    row, _ = env.reset()
-                assert np.array_equal(row, found[0][d])
-        assert len(with_workers.episodes) == 2
-    finally:
-        with_workers.close()
+    doors = VectorDoor(frictions, max_steps=steps)
+    observations, _ = doors.reset(seed=seeds)
+    for env, seed, row in zip(singles, seeds, observations, strict=True):
+        assert np.array_equal(env.reset(seed=seed)[0], row)
+    random = np.random.default_rng(0)
+    for _ in range(2 * steps + 3):
+        actions = 2 * random.normal(size=(3, 6))
+        found = doors.step(actions)
+        for d, env in enumerate(singles):
+            row, earned, _, truncated, info = env.step(actions[d])
+            assert (earned, truncated) == (found[1][d], found[3][d])
+            assert info["door_angle"] == found[4]["door_angle"][d]
+            assert info["opened"] == found[4]["opened"][d]
+            if truncated:
+                assert np.array_equal(row, found[4]["final_obs"][d])
+                row, _ = env.reset()
+            assert np.array_equal(row, found[0][d])
+    assert len(doors.episodes) == 2
 
 
 def test_an_episodes_return_is_the_sum_of_its_rewards():
@@ -300,7 +292,9 @@ def test_a_given_door_stays():
     doors = VectorDoor([params, 0.2], max_steps=5)
     doors.reset(seed=0)
     assert doors.frictions == [0.7, 0.2]
-    assert doors.parts[0].doors.params[0] == params
+    assert doors.params[0] == params
+    doors.reset(seed=1)
+    assert doors.params[0] == params
 
 
 # --------------------------------------------------------------------------------- bad input
@@ -341,6 +335,7 @@ def test_a_friction_that_is_no_number_is_refused():
         ({"timestep": 0.0}, "timestep = 0.0: must be greater than 0"),
         ({"timestep": 0.003}, "timestep = 0.003: a whole number of them must make 0.02 s"),
         ({"render_mode": "human"}, "render_mode = 'human': must be 'rgb_array' or None"),
+        ({"render_mode": "rgb_array"}, "render_mode = 'rgb_array': must come with draw"),
     ],
 )
 def test_an_environment_that_makes_no_sense_is_refused(arguments, error):
@@ -352,11 +347,10 @@ def test_an_environment_that_makes_no_sense_is_refused(arguments, error):
     ("doors", "options", "error"),
     [
         ([], {}, "the number of doors = 0: must be at least 1"),
-        ([0.0, 0.1], {"num_workers": 3}, "num_workers = 3: must be at most 2 doors"),
-        ([0.0], {"num_workers": -1}, "num_workers = -1: must be at least 0"),
         ([0.0, -2.0], {}, "friction = -2.0: must be at least 0"),
         ([0.0], {"max_steps": 0}, "max_steps = 0: must be at least 1"),
         ([0.0], {"timestep": -0.1}, "timestep = -0.1: must be greater than 0"),
+        ([0.0], {"timestep": 0.003}, "timestep = 0.003: a whole number of them must make 0.02 s"),
     ],
 )
 def test_doors_that_make_no_sense_are_refused(doors, options, error):
@@ -369,6 +363,8 @@ def test_steps_before_a_reset_are_refused():
         DoorEnv().step(np.zeros(6))
     with pytest.raises(gym.error.ResetNeeded):
         VectorDoor([0.0]).step(np.zeros((1, 6)))
+    with pytest.raises(gym.error.ResetNeeded):
+        VectorDoor([0.0]).state()
 
 
 def test_seeds_for_other_doors_are_refused():
@@ -386,65 +382,25 @@ def test_actions_of_another_shape_are_refused():
         env.step(np.zeros(5))
 
 
-@pytest.mark.parametrize(("bad", "num_workers"), [(NAN, 0), (math.inf, 0), (NAN, 2)])
-def test_an_action_that_is_not_finite_names_door_and_step(bad, num_workers):
-    doors = VectorDoor([0.0, 0.1], num_workers=num_workers)
-    doors.reset(seed=0)
-    doors.step(np.zeros((2, 6)))
-    actions = np.zeros((2, 6))
+@pytest.mark.parametrize("bad", [NAN, math.inf])
+def test_an_action_that_is_not_finite_names_door_and_step_and_moves_nothing(bad):
+    doors, others = (VectorDoor([0.0, 0.1]) for _ in range(2))
+    for both in (doors, others):
+        both.reset(seed=0)
+        both.step(np.zeros((2, 6)))
+    actions = np.ones((2, 6))
     actions[1, 3] = bad
     with pytest.raises(ValueError, match="of door 1 in step 1: must be finite"):
         doors.step(actions)
-    with pytest.raises(gym.error.ClosedEnvironmentError):
-        doors.step(np.zeros((2, 6)))
+    answers = [both.step(np.zeros((2, 6)))[:4] for both in (doors, others)]
+    for one, other in zip(*answers, strict=True):
+        assert np.array_equal(one, other)
 
 
 def test_a_simulation_that_diverges_names_door_and_step(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # MuJoCo writes a log into the present folder
     doors = VectorDoor([0.0, 0.1])
     doors.reset(seed=0)
-    doors.parts[0].doors.data[1].qvel[0] = 1e12
+    doors.data[1].qvel[0] = 1e12
     with pytest.raises(FloatingPointError, match="of door 1 diverged in step 1"):
         doors.step(np.zeros((2, 6)))
-
-
-def test_a_killed_worker_is_an_error_and_the_others_end():
-    doors = VectorDoor([0.0] * 4, num_workers=2)
-    doors.reset(seed=0)
-    doors.step(np.zeros((4, 6)))
-    first, second = (part.process for part in doors.parts)
-    os.kill(first.pid, signal.SIGKILL)
-    with pytest.raises(WorkerError, match="the worker of doors 0 to 1 ended with exit code -9"):
-        for _ in range(3):
-            doors.step(np.zeros((4, 6)))
-    second.join(timeout=5)
-    assert not second.is_alive()
-
-
-def test_workers_end_with_their_parent(tmp_path):
-    """The parent is killed and can say no farewell; its worker notices."""
-    script = tmp_path / "parent.py"
-    script.write_text(
-        "import time\n"
-        "from ipo.worlds.many_doors import VectorDoor\n"
-        "if __name__ == '__main__':\n"
-        "    doors = VectorDoor([0.0], num_workers=1)\n"
-        "    doors.reset(seed=0)\n"
-        "    print(doors.parts[0].process.pid, flush=True)\n"
-        "    time.sleep(60)\n"
-    )
-    parent = subprocess.Popen([sys.executable, script], stdout=subprocess.PIPE, text=True)
-    worker = int(parent.stdout.readline())
-    parent.kill()
-    parent.wait()
-    for _ in range(100):
-        try:
-            os.kill(worker, 0)
-        except ProcessLookupError:
-            return
-        with open(f"/proc/{worker}/stat") as file:  # ended, but nobody has asked for its status
-            if file.read().split()[2] == "Z":
-                return
-        time.sleep(0.05)
-    os.kill(worker, signal.SIGKILL)
-    pytest.fail("the worker outlived its parent")

@@ -13,9 +13,16 @@ from experiments.door import (
     evaluation_doors,
     load_players,
 )
-from experiments.door_training import CELLS, NETWORK, make_doors, opened, policy_path, published
+from experiments.door_training import (
+    CELLS,
+    NETWORK,
+    last_info,
+    make_doors,
+    policy_path,
+    published_door,
+)
+from experiments.policies import save_policy
 from ipo.dense_network import DenseNetwork
-from ipo.networks import save_policy
 from ipo.worlds.door import DoorEnv
 from ipo.worlds.many_doors import VectorDoor
 
@@ -64,13 +71,13 @@ def test_the_same_doors_at_every_friction(monkeypatch):
 
     class Spy(VectorDoor):
         def close(self, **options):
-            seen.append(self.parts[0].doors.params)
+            seen.append(self.params)
             super().close(**options)
 
     monkeypatch.setattr(door_training, "VectorDoor", Spy)
     players = [NETWORK.start([np.random.default_rng(0)])]
     for friction in (0.0, 1.5):
-        opened(players, friction, 3, EVALUATION_SEED, max_steps=2)
+        last_info(players, friction, 3, EVALUATION_SEED, max_steps=2)["opened"]
     for doors, friction in zip(seen, (0.0, 1.5), strict=True):
         assert [door.friction for door in doors] == [friction] * 3
         assert [door.width for door in doors] == list(table["width"])
@@ -96,13 +103,13 @@ def test_runs_of_the_same_seed_have_the_same_doors_without_friction():
     def first_doors(domains, copies):
         doors = make_doors(domains, copies, [np.random.default_rng(3)])
         doors.reset()
-        return doors.envs.parts[0].doors.params[:4]
+        return doors.envs.params[:4]
 
     assert first_doors([0, 1], [4, 2]) == first_doors([0], [4])
 
 
 def test_the_published_settings():
-    ppo, ipo = published("ppo"), published("ipo")
+    ppo, ipo = published_door("ppo"), published_door("ipo")
     assert (ppo.learning_rate, ipo.learning_rate) == (1e-3, 5e-4)
     assert ppo.num_updates * 32 * ppo.num_steps == pytest.approx(25e6, rel=0.01)
     assert ppo.size_of_minibatches(32 * 4096) == 512

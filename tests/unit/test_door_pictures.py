@@ -4,10 +4,13 @@ import gc
 import subprocess
 import sys
 
+import gymnasium
 import mujoco
 import numpy as np
 import pytest
+from gymnasium.utils.env_checker import check_env
 
+import ipo  # noqa: F401  (registers the environments)
 from experiments.pictures import DoorPicture, RenderError, door_scene
 from ipo.worlds.door import DoorEnv, DoorParams, build_door
 from ipo.worlds.hooking import Hooking
@@ -48,7 +51,7 @@ def test_a_picture_shows_what_moves(picture, joint):
 
 
 def test_the_environment_draws_its_state(picture):
-    env = DoorEnv(render_mode="rgb_array")
+    env = gymnasium.make("ipo/Door-v0", render_mode="rgb_array", draw=DoorPicture)
     env.reset(seed=0)
     first = env.render()
     for _ in range(30):
@@ -58,6 +61,17 @@ def test_the_environment_draws_its_state(picture):
     env.reset(seed=1)
     assert not np.array_equal(env.render(), first)
     env.close()
+
+
+@pytest.mark.filterwarnings("ignore:.*Box observation space")
+def test_gymnasium_finds_nothing_wrong_with_the_pictures(picture):
+    made = gymnasium.make("ipo/Door-v0", max_steps=5, render_mode="rgb_array", draw=DoorPicture)
+    check_env(made.unwrapped)
+
+
+def test_pictures_before_a_reset_are_refused():
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        DoorEnv(render_mode="rgb_array", draw=DoorPicture).render()
 
 
 def test_an_unknown_camera_is_refused():
@@ -82,8 +96,9 @@ def test_without_egl_the_message_names_the_packages_and_doors_still_work():
         "import os; os.environ['PYOPENGL_PLATFORM'] = 'none'\n"
         "import numpy as np\n"
         "from ipo.worlds.door import DoorEnv\n"
-        "from experiments.pictures import RenderError\n"
-        "env = DoorEnv(render_mode='rgb_array'); env.reset(seed=0); env.step(np.zeros(6))\n"
+        "from experiments.pictures import DoorPicture, RenderError\n"
+        "env = DoorEnv(render_mode='rgb_array', draw=DoorPicture)\n"
+        "env.reset(seed=0); env.step(np.zeros(6))\n"
         "try: env.render()\n"
         "except RenderError as error: print(error)\n"
     )

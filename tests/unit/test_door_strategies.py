@@ -6,18 +6,16 @@ import numpy as np
 import pytest
 
 from experiments import door as door_experiments
-from experiments.door import Cell
-from experiments.door_training import CELLS, NETWORK, opened, policy_path
-from ipo.networks import save_policy
+from experiments.door import Cell, ScriptedCell, watch
+from experiments.door_training import CELLS, NETWORK, last_info, policy_path
+from experiments.policies import save_policy
 from ipo.worlds.door import DoorEnv, DoorParams
 from ipo.worlds.hooking import Hooking
 from ipo.worlds.pulling import (
-    ScriptedCell,
     is_inside,
     strategy,
     strategy_of_part,
     strategy_of_policy,
-    watch,
 )
 
 
@@ -96,7 +94,9 @@ def test_a_policy_that_is_watched_opens_the_doors_that_it_opens(tmp_path):
     save_policy(policy_path(tmp_path, "ppo", 0, 95), players, {"seed": 0, "choice": "best"})
     rows = watch(cell, [0], tmp_path)
     success = rows[rows["metric"] == "success"]["value"]
-    assert list(success) == list(opened(players, 0.0, 4, door_experiments.EVALUATION_SEED))
+    assert list(success) == list(
+        last_info(players, 0.0, 4, door_experiments.EVALUATION_SEED)["opened"]
+    )
 
 
 def test_an_unknown_side_is_refused():

@@ -1,99 +1,165 @@
-"""The game: average, rounds of best responses and Nash gap, on a game that is solved by hand.
+"""The game: ownership, rounds, average and Nash gap, on a game that is solved by hand.
 
 Player d wants the average p = (x_1 + x_2) / 2 at its target t_d: J_d = (p - t_d)^2 / 2.
 """
+
+from functools import partial
 
 import pytest
 import torch
 from small import assert_close, general_problem, paper_problem, random_gain
 
-from ipo.game import average, best_response_round, nash_gap, new_players, split_players
+from ipo.game import LinearPlayers, average, domains_of_players, nash_gap, play_round
 from ipo.lqr import invariant_gain, riccati_gain, training_costs
+from ipo.optimizers import make_optimizer
 
 TARGETS = (1.0, 3.0)
+COSTS = [lambda p, target=target: 0.5 * (p - target).square().sum(1) for target in TARGETS]
 
 
-@pytest.fixture
-def weights() -> torch.Tensor:
-    """Of two players in one run, at zero."""
-    return new_players(1, 2, [1], dtype=torch.float64)
+def plain(learning_rate: float = 1.0):
+    return partial(make_optimizer, "plain", learning_rate=learning_rate)
 
 
-def gradient_step(player: torch.Tensor, objective, learning_rate: float = 1.0) -> None:
-    (gradient,) = torch.autograd.grad(objective(), player)
-    player.data -= learning_rate * gradient
+def players_at_zero(learning_rate: float = 1.0, **options) -> LinearPlayers:
+    """Two players in one run, each with plain steps."""
+    return LinearPlayers(torch.zeros(1, 2, 1).double(), plain(learning_rate), **options)
 
 
-def test_players_step_in_order_and_feel_their_share(weights):
+# -------------------------------------------------------------------------------- ownership
+
+
+@pytest.mark.parametrize(
+    ("method", "owned"),
+    [
+        ("pooled", [[0, 1, 2]]),
+        ("ipo", [[0], [1], [2]]),
+        ("ensemble", [[0, 1, 2], [0, 1, 2], [0, 1, 2]]),
+    ],
+)
+def test_who_owns_which_domains(method, owned):
+    assert domains_of_players(method, 3) == owned
+
+
+@pytest.mark.parametrize(
+    ("method", "num_domains", "message"),
+    [("poled", 2, "method = 'poled'.*did you mean 'pooled'"), ("ipo", 0, "num_domains = 0: must")],
+)
+def test_ownership_that_does_not_exist(method, num_domains, message):
+    with pytest.raises(ValueError, match=message):
+        domains_of_players(method, num_domains)
+
+
+# ----------------------------------------------------------------------------------- rounds
+
+
+@pytest.mark.parametrize(
+    ("num_inner_rounds", "phi", "expected"),
+    [(1, False, "012"), (1, True, "p012"), (2, True, "p012012")],
+)
+def test_order_of_the_moves_in_a_round(num_inner_rounds, phi, expected):
+    moves = []
+    move_phi = partial(moves.append, "p") if phi else None
+    play_round(3, lambda d: moves.append(str(d)), num_inner_rounds, move_phi)
+    assert "".join(moves) == expected
+
+
+def test_players_step_in_order_and_feel_their_share():
     """dJ_d/dx_d = (p - t_d) / 2. Player 1: 0 + 1/2; then p = 1/4 and player 2: 0 + 11/8."""
-    players, policy = split_players(weights), average(weights)
-
-    def respond(d, policy_of_d):
-        gradient_step(players[d], lambda: 0.5 * (policy_of_d() - TARGETS[d]).square().sum())
-
-    best_response_round(players, policy, respond)
-    assert weights.flatten().tolist() == [0.5, 1.375]
-    assert policy.tolist() == [[0.9375]]
+    players = players_at_zero()
+    players.round(COSTS)
+    assert players.weights.flatten().tolist() == [0.5, 1.375]
+    assert players.policy.tolist() == [[0.9375]]
 
 
-def test_best_responses_end_where_the_last_player_wants_the_average(weights):
-    players, policy = split_players(weights), average(weights)
-
-    def respond(d, policy_of_d):
-        players[d].data += 2 * (TARGETS[d] - policy_of_d().detach())
-
-    best_response_round(players, policy, respond)
-    assert weights.flatten().tolist() == [2.0, 4.0]  # first p = 1, then p = 3
-    assert policy.tolist() == [[3.0]]
+def test_players_who_move_together_see_the_same_average():
+    players = players_at_zero(order="together")
+    players.round(COSTS)
+    assert players.weights.flatten().tolist() == [0.5, 1.5]
+    assert players.policy.tolist() == [[1.0]]
 
 
-def test_a_player_sees_the_average_of_its_present_weights(weights):
-    players, policy = split_players(weights), average(weights)
-    seen = []
-
-    def respond(d, policy_of_d):
-        for move in (0.0, 1.0):
-            players[d].data += move
-            seen.append(policy_of_d().item())
-
-    best_response_round(players, policy, respond)
-    assert seen == [0.0, 0.5, 0.5, 1.0]
+@pytest.mark.parametrize("order", ["in_turn", "together"])
+def test_inner_rounds_are_rounds_above_the_same_phi(order):
+    once, twice, moves = players_at_zero(order=order), players_at_zero(order=order), []
+    once.round(COSTS, num_inner_rounds=2, move_phi=lambda: moves.append(once.policy.item()))
+    for _ in range(2):
+        twice.round(COSTS)
+    assert torch.equal(once.weights, twice.weights)
+    assert torch.equal(once.policy, twice.policy)
+    assert moves == [0.0]
 
 
-def test_policy_is_updated_in_place_to_the_average_of_the_players():
-    weights = new_players(3, 4, [2, 5], dtype=torch.float64)
-    weights += torch.randn(3, 4, 2, 5, generator=torch.Generator().manual_seed(0)).double()
-    players, policy = split_players(weights), average(weights)
-    place, before = policy.data_ptr(), policy.clone()
+def test_steps_that_solve_end_where_the_last_player_wants_the_average():
+    """d^2 J_d / dx_d^2 = 1/4: with a learning rate of 4 a step is the best response."""
+    players = players_at_zero(learning_rate=4.0)
+    players.round(COSTS)
+    assert players.weights.flatten().tolist() == [2.0, 4.0]  # first p = 1, then p = 3
+    assert players.policy.tolist() == [[3.0]]
 
-    def respond(d, policy_of_d):
-        gradient_step(players[d], lambda: (policy_of_d() - d).square().sum())
 
-    best_response_round(players, policy, respond)
-    assert not torch.allclose(policy, before)
-    assert_close(policy, average(weights), rtol=1e-14)
-    assert policy.data_ptr() == place
+def test_a_player_sees_the_average_of_its_present_weights():
+    """L-BFGS tries several weights in a step; each trial is seen with the others' old ones."""
+    players, seen = players_at_zero(), []
+
+    def recorded(p: torch.Tensor) -> torch.Tensor:
+        seen.append((p.item(), [player.item() for player in players.players]))
+        return COSTS[0](p)
+
+    players.optimizers[0] = make_optimizer("lbfgs", players.players[:1], 1.0)
+    players.round([recorded, COSTS[1]])
+    assert len(seen) > 1
+    assert seen[-1][1][0] != 0
+    assert all(p == sum(weights) / 2 for p, weights in seen)
+
+
+@pytest.mark.parametrize("order", ["in_turn", "together"])
+def test_policy_is_updated_in_place_to_the_average_of_the_players(order):
+    starts = torch.randn(3, 4, 2, 5, generator=torch.Generator().manual_seed(0)).double()
+    players = LinearPlayers(starts, plain(0.1), order=order)
+    place, before = players.policy.data_ptr(), players.policy.clone()
+    players.round([lambda p, d=d: (p - d).square().sum((1, 2)) for d in range(4)])
+    assert not torch.allclose(players.policy, before)
+    assert_close(players.policy, average(players.weights), rtol=1e-14)
+    assert players.policy.data_ptr() == place
+
+
+def test_bounded_players_are_put_back():
+    players = players_at_zero(learning_rate=100.0, bound=0.5)
+    players.round([COSTS[0], lambda p: COSTS[1](-p)])
+    assert players.weights.flatten().tolist() == [0.5, -0.5]
+    assert players.policy.tolist() == [[0.0]]
+
+
+def test_gradients_are_clipped():
+    """Player 1's gradient is -1/2 and stays; player 2's is -11/8 and becomes -1."""
+    players = players_at_zero(max_gradient_norm=1.0)
+    players.round(COSTS)
+    assert players.weights.flatten().tolist() == [0.5, 1.0]
 
 
 def test_average_is_over_players():
     assert average(torch.tensor([[[1.0, 2.0], [3.0, 6.0]]])).tolist() == [[2.0, 4.0]]
 
 
-def test_new_players_are_zero_and_each_contiguous():
-    weights = new_players(2, 3, [4, 5], dtype=torch.float64)
-    assert weights.shape == (2, 3, 4, 5)
-    assert weights.dtype == torch.float64
-    assert not weights.any()
-    assert all(player.is_contiguous() for player in weights.unbind(1))
+def test_players_are_contiguous_leaves_that_leave_their_start_alone():
+    starts = torch.randn(2, 4, 5).double().unsqueeze(1).expand(-1, 3, -1, -1)
+    given = starts.clone()
+    players = LinearPlayers(starts, plain())
+    assert torch.equal(players.weights, given)
+    assert [tuple(player.shape) for player in players.players] == [(2, 4, 5)] * 3
+    for player in players.players:
+        assert player.is_contiguous() and player.is_leaf and player.requires_grad
+    players.round([lambda p: p.square().sum((1, 2))] * 3)
+    assert torch.equal(starts, given)
 
 
-def test_split_players_are_leaves_that_share_memory():
-    weights = new_players(2, 3, [4])
-    players = split_players(weights)
-    assert [tuple(player.shape) for player in players] == [(2, 4)] * 3
-    assert all(player.is_leaf and player.requires_grad for player in players)
-    players[1].data += 1
-    assert weights[:, 1].eq(1).all() and not weights[:, [0, 2]].any()
+def test_order_that_does_not_exist():
+    with pytest.raises(ValueError, match=r"order = 'togeter'.*did you mean 'together'"):
+        players_at_zero(order="togeter")
+
+
+# --------------------------------------------------------------------------------- Nash gap
 
 
 def test_nash_gap_is_the_largest_gain_of_a_single_player():

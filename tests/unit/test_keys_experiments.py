@@ -1,31 +1,37 @@
 """The coloured-keys experiment: its protocol by hand, what networks see, and the shipped data."""
 
+import json
 from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
+import scipy.stats
 import torch
 from minigrid.core.constants import OBJECT_TO_IDX
 
+from experiments import keys as experiment
 from experiments.keys import (
-    MODULES,
+    EXPERIMENTS,
     Cell,
     Keys,
     encode,
     evaluate,
     exact,
+    published,
     published_protocol,
     recolor,
+    returns,
     run_cell,
     run_curve,
+    runs_of,
 )
-from experiments.store import provenance, stale_batches
-from ipo.networks import GridNetwork, load_policy
-from ipo.ppo import published
+from experiments.policies import load_policy
+from experiments.store import Batch, Store
+from ipo.networks import GridNetwork
 from ipo.worlds.colored_keys import COLORS
-from ipo.worlds.tabular import TabularTask, expected_return
+from ipo.worlds.tabular import TabularTask, expected_return, occupancy
 
 DATA = Path(__file__).resolve().parents[2] / "data"
 RESULTS, POLICIES = DATA / "results" / "keys", DATA / "policies" / "keys"
@@ -299,6 +305,7 @@ def shipped() -> dict[str, pd.DataFrame]:
 
 def test_every_shipped_file_is_tested_here():
     assert {path.stem for path in RESULTS.glob("*.csv")} == SHIPPED.keys() | {"grids"}
+    assert EXPERIMENTS.keys() == SHIPPED.keys() | {"grids"}
 
 
 @pytest.mark.parametrize("name", SHIPPED)
@@ -319,10 +326,9 @@ def test_every_shipped_run_is_there_with_every_metric_in_every_color(shipped, na
     assert np.isfinite(rows["value"]).all()
 
 
-@pytest.mark.parametrize("name", SHIPPED)
-def test_shipped_rows_are_whole_and_come_from_todays_code(name):
-    assert provenance(RESULTS, name)  # checks every batch against its rows
-    assert stale_batches(RESULTS, name, MODULES) == []
+def batches(name: str) -> list[Batch]:
+    """The origin of the shipped rows, each batch checked against its rows."""
+    return Store(RESULTS, name).batches()
 
 
 def settings_of(label: str, color_encoding: str) -> dict:
@@ -336,7 +342,7 @@ def settings_of(label: str, color_encoding: str) -> dict:
 
 @pytest.mark.parametrize("name", SHIPPED)
 def test_shipped_rows_are_of_the_published_settings(name):
-    for batch in provenance(RESULTS, name):
+    for batch in batches(name):
         label, encoding = batch["columns"]["method"], batch["columns"]["color_encoding"]
         assert batch["cell"]["settings"] == settings_of(label, encoding)
         assert "+".join(batch["cell"]["train_colors"]) == batch["columns"]["train_colors"]
@@ -439,6 +445,203 @@ def test_shipped_policies_have_every_shipped_metric(shipped, keys_of, method):
     for (color, metric), values in metrics.items():
         expected = shipped_values(shipped, cell, color, metric)
         assert values == pytest.approx(expected, rel=0, abs=1e-6), (color, metric)
+
+
+# ------------------------------------------------------------------------- arms of the chapter
+
+
+@pytest.mark.parametrize(
+    ("name", "arms"),
+    [
+        ("main", experiment.main_arms(20)),
+        ("variants", experiment.variant_arms(20)),
+        ("larger", experiment.larger_arms(20, 6)),
+    ],
+)
+def test_arms_of_the_chapter_are_those_of_the_shipped_rows(name, arms):
+    cells = {json.dumps(batch["cell"]) for batch in batches(name)}
+    assert {json.dumps(asdict(cell)) for cell in arms} == cells
+    assert len(arms) == len(SHIPPED[name])
+
+
+def test_every_arm_of_a_table_has_a_name():
+    labels = {name: {cell[0] for cell in cells} for name, cells in SHIPPED.items()}
+    assert experiment.MAIN.keys() == labels["main"]
+    assert experiment.LARGER.keys() == labels["larger"]
+    others = {arm for arm in labels["variants"] if arm.endswith(("3colors", "normalized"))}
+    assert experiment.SETTINGS.keys() == others | {"ppo", "ipo"}
+
+
+# -------------------------------------------------------------------------- read off the rows
+
+
+def made_up(values: dict[tuple[str, str], list[float]], metric: str = "return_exact"):
+    """Rows of made-up runs by arm and colour, the last run first."""
+    return pd.DataFrame(
+        {"method": method, "domain": color, "run": run, "metric": metric, "value": value}
+        for (method, color), runs in values.items()
+        for run, value in reversed(list(enumerate(runs)))
+    )
+
+
+def test_runs_of_an_arm_are_in_the_order_of_their_seeds():
+    rows = made_up({("ppo", "grey"): [0.1, 0.2, 0.3], ("ipo", "grey"): [0.5], ("ppo", "red"): [1]})
+    other = made_up({("ppo", "grey"): [9.0]}, "success")
+    found = runs_of(pd.concat([rows, other]), "ppo", "grey")
+    assert found.to_dict() == {0: 0.1, 1: 0.2, 2: 0.3} and found.tolist() == [0.1, 0.2, 0.3]
+
+
+def test_table_has_the_mean_and_deviation_over_runs_beside_the_papers():
+    rows = made_up({("ppo", "red"): [0.25, 0.75], ("ipo", "red"): [1, 1], ("ppo", "grey"): [0]})
+    names = {"ipo": "I", "ppo": "P"}
+    paper = pd.DataFrame({"method": ["ipo"], "domain": ["red"], "text": ["0.9 ± 0.1"]})
+    table = experiment.table_by(rows, names, "return_exact", ["red"], paper)
+    assert table.to_dict("list") == {
+        "arm": ["I", "P"],
+        "red": ["1.000 ± 0.000", "0.500 ± 0.250"],
+        "red, paper": ["0.9 ± 0.1", ""],
+    }
+
+
+def test_comparison_on_grey_by_hand():
+    ours, theirs = [0.5, 0.75, 1.0], [0.25, 0.5, 0.75]  # run by run 0.25 more
+    rows = made_up({("ipo", "grey"): ours, ("ppo", "grey"): theirs})
+    (row,) = experiment.comparison(rows, [("ipo", "ppo")], np.random.default_rng(0)).to_dict(
+        "records"
+    )
+    assert row["difference on grey"] == "IPO, as published − PPO, as published"
+    assert row["mean"] == 0.25 and row["95 % interval"] == "[+0.250, +0.250]"
+    assert row["P(improvement)"] == pytest.approx((6 + 2 / 2) / 9)  # of nine pairs two are equal
+    t = 0.25 / np.sqrt(2 * 0.0625 / 3)
+    assert row["p (Welch)"] == pytest.approx(2 * scipy.stats.t.sf(t, df=4))
+    assert experiment.gap(rows, "ipo", "ppo", np.random.default_rng(0)) == "+0.250 [+0.250, +0.250]"
+    assert experiment.gap(rows, "ppo", "ipo", np.random.default_rng(0)).startswith("-0.250")
+
+
+def test_draws_are_of_the_published_protocol_and_of_each_methods_own_runs():
+    values = {("ipo", "grey"): [1.0, 3.0], ("ppo", "grey"): [10.0, 20.0, 60.0]}
+    rows = pd.concat(
+        [
+            made_up(values, "return_published_protocol"),
+            made_up({key: [-1.0] * 5 for key in values}),
+        ]
+    )
+    drawn = experiment.draws_of_ten(rows, np.random.default_rng(0), num_draws=20_000)
+    assert drawn["ipo"].shape == drawn["ppo"].shape == (20_000, 10)
+    assert set(drawn["ipo"].flat) == {1, 3} and set(drawn["ppo"].flat) == {10, 20, 60}
+    for method, runs in (("ipo", [1, 3]), ("ppo", [10, 20, 60])):
+        error = np.std(runs) / np.sqrt(10 * 20_000)
+        assert abs(drawn[method].mean() - np.mean(runs)) < 5 * error
+
+
+def test_runs_needed_have_the_stated_power():
+    """Normal samples of so many runs: the two-sample test finds the difference in 80 %."""
+    rng = np.random.default_rng(0)
+    values = rng.normal(size=(2, 1000))
+    values = (values - values.mean(1, keepdims=True)) / values.std(1, ddof=1, keepdims=True)
+    rows = made_up({("ipo", "grey"): 2 * values[0], ("ppo", "grey"): 0.5 * values[1]})
+    needed = experiment.runs_needed(rows, 0.5)
+    one, other = rng.normal(0.5, 2, (4000, needed)), rng.normal(0, 0.5, (4000, needed))
+    found = scipy.stats.ttest_ind(one, other, axis=1, equal_var=False).pvalue < 0.05
+    assert found.mean() == pytest.approx(0.8, abs=0.03)
+
+
+def test_computed_rows_stand_beside_the_shipped_ones_of_the_same_run():
+    shipped = made_up({("ppo", "red"): [0.1, 0.2], ("ppo", "grey"): [0.3, 0.4]}).assign(frames=64)
+    again = shipped[shipped["domain"] == "red"].assign(value=[0.25, 0.1]).iloc[::-1]
+    both = experiment.beside(shipped, again)
+    assert both["run"].tolist() == [0, 1] and both["value_shipped"].tolist() == [0.1, 0.2]
+    assert both["difference"].tolist() == pytest.approx([0, 0.05])
+    (row,) = experiment.by_update(both).to_dict("records")
+    assert (row.pop("arm"), row.pop("frames")) == ("PPO, as published", 64)
+    means = {"red, shipped": 0.15, "red, live": 0.175, "largest difference": 0.05}
+    assert row == pytest.approx(means)
+    with pytest.raises(ValueError, match="1 of 2 rows are not among the shipped"):
+        experiment.beside(shipped[shipped["run"] == 0], again)
+
+
+def test_encodings_keep_the_arms_of_each_network_apart(shipped):
+    panels = experiment.encodings(shipped["main"], shipped["variants"])
+    variants = shipped["variants"]
+    for (rows, colors), (suffix, encoding, arms) in zip(
+        panels.values(),
+        [
+            ("", "integer", MAIN),
+            ("_inside", "integer", [("ppo",), ("ipo",)]),
+            ("", "one_hot", [("ppo",), ("ipo",), ("ensemble",)]),
+            ("", "none", [("ppo",), ("ipo",), ("ensemble",)]),
+        ],
+        strict=True,
+    ):
+        assert set(rows["method"]) == {arm[0] for arm in arms}
+        assert set(rows["color_encoding"]) == {encoding}
+        assert set(rows["train_colors"]) == {"+".join(colors)}
+        assert [COLORS[code] for code in rows["code"]] == rows["domain"].tolist()
+        source = shipped["main"] if arms is MAIN else variants[variants.color_encoding == encoding]
+        assert runs_of(rows, "ipo", "blue").equals(runs_of(source, f"ipo{suffix}", "blue"))
+
+
+def test_steps_of_the_task_follow_one_another(shipped):
+    steps = experiment.subtasks(shipped["main"])
+    assert list(steps.index) == [(arm, c) for arm in experiment.MAIN for c in ("red", "grey")]
+    assert list(steps.columns) == ["holds the key", "unlocks the door", "reaches the goal"]
+    expected = runs_of(shipped["main"], "ipo", "grey", "unlocks_door").mean()
+    assert steps.loc[("ipo", "grey"), "unlocks the door"] == pytest.approx(expected)
+
+
+# ------------------------------------------------------------------ read off saved policies
+
+
+def test_returns_are_those_of_the_exact_metrics(trained):
+    task, players = trained
+    metrics = exact(task, players)
+    assert returns(task, players).keys() == {(color, "return_exact") for color in COLORS}
+    for key, values in returns(task, players, ["grey", "red"]).items():
+        assert values.tolist() == metrics[key].tolist()
+
+
+def test_a_policy_sees_grey_keys_and_walls_as_they_are_in_code_5(trained):
+    task, players = trained
+    rows = experiment.beyond_codes(task, {"ipo": players}, walls=[2, 5], codes=[0, 5])
+    assert len(rows) == 2 * 2 * 2 and set(rows["method"]) == {"ipo"}
+    grey = returns(task, players)["grey", "return_exact"]
+    seen = rows.set_index(["wall", "code", "run"])["value"]
+    assert seen[5, 5].tolist() == grey.tolist()
+    # A red key in the grey domain: what is seen is what the red domain shows.
+    assert seen[5, 0].tolist() == pytest.approx(
+        returns(task, players)["red", "return_exact"], rel=1e-9
+    )
+    assert (seen[2, 5] != grey).all()
+
+
+def test_temperatures_lead_from_the_best_action_to_the_policy_to_chance(trained):
+    task, players = trained
+    rows = experiment.by_temperature(task, {"ipo": players}, ["green"], [0.0, 1.0, 1e9])
+    found = rows.set_index(["temperature", "run"])["value"]
+    metrics, table = exact(task, players), task.tasks["green"]
+    assert found[0.0].tolist() == metrics["green", "return_greedy"].tolist()
+    assert found[1.0].tolist() == pytest.approx(metrics["green", "return_exact"], rel=1e-12)
+    uniform = np.full((1, len(table.images), 7), 1 / 7)
+    assert found[1e9].tolist() == pytest.approx(list(expected_return(table, uniform)[0]) * 2)
+
+
+def test_visits_count_every_step_in_the_cell_where_it_is_spent(trained):
+    task, players = trained
+    spent = experiment.visits(task, players, "red")
+    table = task.tasks["red"]
+    assert spent.shape == (3, 5, 5)
+    assert (spent[:, [0, -1], :] == 0).all() and (spent[:, :, [0, -1]] == 0).all()
+    steps = occupancy(table, task.policy(players, "red")).mean(0)
+    assert spent.sum() == pytest.approx(steps.sum()) and steps.sum() <= table.horizon
+    x, y = table.position[7]
+    here = (table.position == (x, y)).all(1) & (table.progress == table.progress[7])
+    assert spent[table.progress[7], y, x] == pytest.approx(steps[here].sum())
+
+
+def test_description_of_a_table(keys):
+    found = experiment.description(keys["grey"])
+    assert found.pop("optimal return") == pytest.approx(0.9646, abs=1e-9)
+    assert found == {"layouts": 48, "states": 520, "distinct observations": 289}
 
 
 @pytest.mark.slow

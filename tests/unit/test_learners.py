@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 import straightforward
 import torch
-from small import assert_close, paper_problem, random_gain
+from small import assert_close, paper_problem, random_gain, trained_gain
 from torch import Tensor
 
-from ipo.game import average, best_response_round, new_players, split_players
 from ipo.lqr import LQR, invariant_gain, minimum_norm_gain, project, row_space, training_costs
-from ipo.lqr_learners import METHODS, Settings, published, train, trained_gain
+from ipo.lqr_learners import LQR_METHODS, LQRSettings, published_lqr, train
 from ipo.optimizers import descend, make_optimizer
 
 SEEDS = [0, 1]
@@ -20,12 +19,12 @@ UNLAYERED = ("gradient_descent", "ipo_fixed_phi")
 LAYERED = ("overparameterized", "ipo_variable_phi")
 
 
-def settings(method: str, optimizer: str = "adam", **options) -> Settings:
-    """Settings in which little training does much."""
+def settings(method: str, optimizer: str = "adam", **options) -> LQRSettings:
+    """LQRSettings in which little training does much."""
     defaults = {"learning_rate": 0.01, "num_iterations": 20, "num_hidden": 5}
     if method in LAYERED:
         defaults |= {"phi_scale": 0.1, "gain_scale": 0.1}
-    return Settings(method, optimizer, **(defaults | options))
+    return LQRSettings(method, optimizer, **(defaults | options))
 
 
 def permuted_domains(problem: LQR, order: Sequence[int]) -> LQR:
@@ -44,7 +43,7 @@ def outside(K: Tensor, problem: LQR) -> Tensor:
 # ---------------------------------------------------------------------- slow versions
 
 
-def slow_layers(problem: LQR, chosen: Settings, seed: int) -> tuple[Tensor, Tensor]:
+def slow_layers(problem: LQR, chosen: LQRSettings, seed: int) -> tuple[Tensor, Tensor]:
     """The documented start: a stream spawned from the seed gives ``Phi``, then the controller."""
     random = np.random.default_rng(np.random.SeedSequence(seed).spawn(1)[0])
     n_u, n_o = problem.gain_shape
@@ -63,7 +62,7 @@ def pooled(K: Tensor, A: Tensor, Ws: list[Tensor]) -> Tensor:
     return sum(straightforward.cost(K, A, W) for W in Ws) / len(Ws)
 
 
-def slow_overparameterized(problem: LQR, chosen: Settings, r: int) -> Tensor:
+def slow_overparameterized(problem: LQR, chosen: LQRSettings, r: int) -> Tensor:
     A, Ws = problem.A[r], list(problem.W_train[r])
     Phi, K = slow_layers(problem, chosen, SEEDS[r])
     optimizer = torch.optim.Adam([Phi, K], lr=chosen.learning_rate)
@@ -72,7 +71,7 @@ def slow_overparameterized(problem: LQR, chosen: Settings, r: int) -> Tensor:
     return (K @ Phi).detach()
 
 
-def slow_ipo_variable_phi(problem: LQR, chosen: Settings, r: int) -> Tensor:
+def slow_ipo_variable_phi(problem: LQR, chosen: LQRSettings, r: int) -> Tensor:
     A, Ws = problem.A[r], list(problem.W_train[r])
     Phi, K = slow_layers(problem, chosen, SEEDS[r])
     players = [K.detach().clone().requires_grad_() for _ in Ws]
@@ -86,13 +85,13 @@ def slow_ipo_variable_phi(problem: LQR, chosen: Settings, r: int) -> Tensor:
     return (sum(players) / len(Ws) @ Phi).detach()
 
 
-def slow_gradient_descent(problem: LQR, chosen: Settings, r: int) -> Tensor:
+def slow_gradient_descent(problem: LQR, chosen: LQRSettings, r: int) -> Tensor:
     return straightforward.gradient_descent(
         problem.A[r], list(problem.W_train[r]), chosen.num_iterations, chosen.learning_rate
     )
 
 
-def slow_ipo_fixed_phi(problem: LQR, chosen: Settings, r: int) -> Tensor:
+def slow_ipo_fixed_phi(problem: LQR, chosen: LQRSettings, r: int) -> Tensor:
     return straightforward.ipo_fixed_phi(
         problem.A[r], list(problem.W_train[r]), chosen.num_iterations, chosen.learning_rate
     )
@@ -101,7 +100,7 @@ def slow_ipo_fixed_phi(problem: LQR, chosen: Settings, r: int) -> Tensor:
 SLOW = (slow_gradient_descent, slow_overparameterized, slow_ipo_fixed_phi, slow_ipo_variable_phi)
 
 
-@pytest.mark.parametrize("slow", SLOW, ids=METHODS)
+@pytest.mark.parametrize("slow", SLOW, ids=LQR_METHODS)
 def test_learns_what_the_slow_version_learns(slow: Callable):
     problem = paper_problem(SEEDS)
     chosen = settings(slow.__name__.removeprefix("slow_"), num_iterations=40)
@@ -114,19 +113,14 @@ def test_learns_what_the_slow_version_learns(slow: Callable):
 
 
 @pytest.mark.parametrize("optimizer", ["adam", "plain"])
-def test_one_player_that_owns_all_domains_is_gradient_descent(optimizer):
+def test_gradient_descent_is_the_game_of_one_player_that_owns_all_domains(optimizer):
     problem = paper_problem()
     chosen = settings("gradient_descent", optimizer)
-    weights = new_players(2, 1, problem.gain_shape, dtype=torch.float64)
-    (player,), policy = split_players(weights), average(weights)
-    own = make_optimizer(optimizer, [player], chosen.learning_rate)
-
-    def respond(_: int, policy_of_d: Callable[[], Tensor]) -> None:
-        descend(own, lambda: training_costs(policy_of_d(), problem).mean(1))
-
+    K = torch.zeros(2, *problem.gain_shape).double().requires_grad_()
+    own = make_optimizer(optimizer, [K], chosen.learning_rate)
     for _ in range(chosen.num_iterations):
-        best_response_round([player], policy, respond)
-    assert torch.equal(policy, trained_gain(problem, chosen, SEEDS))
+        descend(own, lambda: training_costs(K, problem).mean(1))
+    assert torch.equal(K.detach(), trained_gain(problem, chosen, SEEDS))
 
 
 def test_ipo_in_one_domain_is_gradient_descent():
@@ -160,7 +154,7 @@ def test_adam_leaves_the_row_space(method):
     assert (outside(K, problem) > 0.1 * torch.linalg.matrix_norm(K)).all()
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", LQR_METHODS)
 @pytest.mark.parametrize("optimizer", ["adam", "plain", "lbfgs"])
 def test_training_lowers_the_cost_in_every_run(method, optimizer):
     problem = paper_problem()
@@ -198,7 +192,7 @@ def test_order_of_players_matters_to_second_order_in_the_step_only():
     assert_close(norm(large[0] - large[1]) / norm(small[0] - small[1]), [100, 100], rtol=0.1)
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", LQR_METHODS)
 @pytest.mark.parametrize("optimizer", ["adam", "plain", "lbfgs"])
 def test_runs_together_are_the_runs_alone(method, optimizer):
     problem, chosen = paper_problem(SEEDS), settings(method, optimizer)
@@ -207,7 +201,7 @@ def test_runs_together_are_the_runs_alone(method, optimizer):
     assert_close(together, torch.cat(alone))
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", LQR_METHODS)
 def test_permuting_the_runs_permutes_what_they_learn(method):
     problem, order = paper_problem([0, 1, 2]), [2, 0, 1]
     gain = trained_gain(problem, settings(method), [0, 1, 2])
@@ -231,7 +225,7 @@ def test_run_that_diverges_spoils_only_itself(method):
 # ----------------------------------------------------------------------------- reports
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", LQR_METHODS)
 def test_reports_come_at_the_checkpoints_and_at_the_end(method):
     problem = paper_problem()
     chosen = settings(method, num_iterations=5)
@@ -272,9 +266,9 @@ def test_the_seed_decides_the_random_start(method):
     assert not torch.allclose(gains[0][1], gains[1][1])
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", LQR_METHODS)
 def test_published_settings_are_the_papers(method):
-    chosen = published(method)
+    chosen = published_lqr(method)
     rate = 5e-4 if method.startswith("ipo") else 1e-3
     assert (chosen.method, chosen.optimizer) == (method, "adam")
     assert (chosen.learning_rate, chosen.num_iterations, chosen.num_hidden) == (rate, 5000, 200)

@@ -6,9 +6,8 @@ import pytest
 import torch
 
 from experiments.figures import network_graph
-from ipo.dense_network import DenseNetwork
 from ipo.distributions import Categorical
-from ipo.networks import GridNetwork
+from ipo.networks import DenseNetwork, GridNetwork
 
 NETWORKS = {
     "grid": (GridNetwork(), (1, 2, 7, 7, 3)),

@@ -11,7 +11,8 @@ from plain_ppo import ActorCritic
 from small import DoubleNetwork, assert_close, plain_network
 from torch import Tensor
 
-from ipo.networks import GridNetwork, OnTable, Weights, load_policy, save_policy
+from experiments.policies import load_policy, save_policy
+from ipo.networks import GridNetwork, Network, OnTable, Weights, copied
 
 
 def generators(*seeds: int) -> list[np.random.Generator]:
@@ -223,6 +224,23 @@ def test_frozen_table_keeps_the_players_as_they_were():
     before = policy(indices)[0].clone()
     player["actor2.bias"] += 1
     assert torch.equal(policy(indices)[0], before)
+
+
+def test_copies_do_not_change_with_the_players():
+    player = {n: w.requires_grad_() for n, w in GridNetwork().start(generators(0)).items()}
+    (kept,) = copied([player])
+    with torch.no_grad():
+        player["actor2.bias"] += 1
+    assert not kept["actor2.bias"].any() and not kept["actor2.bias"].requires_grad
+
+
+def test_a_network_without_weights_or_outputs_cannot_be_made():
+    class Half(Network):
+        def _draw(self, generator):
+            return {}
+
+    with pytest.raises(TypeError, match="abstract"):
+        Half()
 
 
 # ------------------------------------------------------------------------------- files

@@ -19,20 +19,25 @@ from minigrid.wrappers import ImgObsWrapper
 from small import DoubleNetwork, assert_close, plain_network
 from torch import Tensor
 
+from experiments.keys import published
 from ipo.distributions import Categorical
-from ipo.networks import GridNetwork, OnTable, Weights
+from ipo.networks import GridNetwork, OnTable, Weights, copied
 from ipo.ppo import (
     METHODS,
-    Settings,
+    PPOSettings,
+    Training,
     clip_gradients,
     clipped_loss,
-    improve,
     minibatches,
-    published,
-    train,
 )
-from ipo.rollouts import Rollout, Step, advantages, collect
-from ipo.vector_environments import FromGymnasium
+from ipo.rollouts import (
+    Collector,
+    FromGymnasium,
+    Rollout,
+    Step,
+    advantages,
+    value_errors,
+)
 from ipo.worlds.colored_keys import ColoredKeysEnv
 from ipo.worlds.tabular import TabularDomains, expected_return, optimal_policy, tabulate
 
@@ -82,7 +87,7 @@ def of_gymnasium(
     return FromGymnasium(envs, len(generators), seed=FIRST_SEED + sum(domains))
 
 
-def plain_runs(settings: Settings, num_domains: int, seeds: Sequence[int]) -> list[list]:
+def plain_runs(settings: PPOSettings, num_domains: int, seeds: Sequence[int]) -> list[list]:
     """What the plain loop makes of every run: its players after the last update."""
     owned = settings.domains_of_players(num_domains)
     copies = settings.num_envs // sum(map(len, owned))
@@ -137,10 +142,10 @@ ARMS = {
 @pytest.mark.parametrize(("method", "num_domains", "changes"), ARMS.values(), ids=ARMS.keys())
 def test_learns_what_the_plain_loop_learns(method, num_domains, changes):
     """All weights after several updates in MiniGrid, two runs at once, to nine digits."""
-    settings, seeds = Settings(method, **(SMALL | changes)), [3, 5]
+    settings, seeds = PPOSettings(method, **(SMALL | changes)), [3, 5]
     network = DoubleNetwork()
-    reports = train(network, network.start, of_gymnasium, num_domains, settings, seeds)
-    *_, (num_frames, players) = reports
+    training = Training(network, of_gymnasium, num_domains, settings, seeds)
+    *_, (num_frames, players) = training.reports()
     assert num_frames == settings.num_updates * settings.num_envs * settings.num_steps
     assert_same_players(players, plain_runs(settings, num_domains, seeds))
 
@@ -165,13 +170,11 @@ def double_on_table(domains: TabularDomains) -> OnTable:
 
 
 def trained(
-    domains: TabularDomains, settings: Settings, seeds: Sequence[int], num_domains: int = 2
+    domains: TabularDomains, settings: PPOSettings, seeds: Sequence[int], num_domains: int = 2
 ) -> list[Weights]:
-    network = double_on_table(domains)
-    *_, (_, players) = train(
-        network, network.network.start, domains, num_domains, settings, list(seeds)
-    )
-    return [{name: weight.detach() for name, weight in player.items()} for player in players]
+    training = Training(double_on_table(domains), domains, num_domains, settings, list(seeds))
+    *_, (_, players) = training.reports()
+    return copied(players)
 
 
 @pytest.fixture(scope="module")
@@ -181,7 +184,7 @@ def pair(keys) -> TabularDomains:
 
 @pytest.mark.parametrize("method", METHODS)
 def test_stacked_runs_learn_what_separate_runs_learn(pair, method):
-    settings = Settings(method, **SMALL)
+    settings = PPOSettings(method, **SMALL)
     together = trained(pair, settings, [4, 0, 2])
     for r, seed in enumerate([4, 0, 2]):
         alone = trained(pair, settings, [seed])
@@ -191,12 +194,12 @@ def test_stacked_runs_learn_what_separate_runs_learn(pair, method):
 
 
 def test_runs_of_different_seeds_differ(pair):
-    (player,) = trained(pair, Settings("ppo", **SMALL), [0, 1])
+    (player,) = trained(pair, PPOSettings("ppo", **SMALL), [0, 1])
     assert not torch.allclose(player["actor2.weight"][0], player["actor2.weight"][1], atol=0.1)
 
 
 def test_same_seeds_learn_the_same(pair):
-    settings = Settings("ipo", **SMALL)
+    settings = PPOSettings("ipo", **SMALL)
     for ours, theirs in zip(
         trained(pair, settings, [0]), trained(pair, settings, [0]), strict=True
     ):
@@ -207,21 +210,22 @@ def test_same_seeds_learn_the_same(pair):
 def test_one_domain_makes_every_method_ppo(keys, method):
     domains = TabularDomains([keys["blue"]])
     ((ppo,), (other,)) = (
-        trained(domains, Settings(name, **SMALL), [0, 1], num_domains=1) for name in ("ppo", method)
+        trained(domains, PPOSettings(name, **SMALL), [0, 1], num_domains=1)
+        for name in ("ppo", method)
     )
     assert all(torch.equal(ppo[name], other[name]) for name in ppo)
 
 
 def test_number_of_players_and_what_they_own():
-    assert Settings("ppo").domains_of_players(3) == [[0, 1, 2]]
-    assert Settings("ipo").domains_of_players(3) == [[0], [1], [2]]
-    assert Settings("ensemble").domains_of_players(3) == [[0, 1, 2]] * 3
+    assert PPOSettings("ppo").domains_of_players(3) == [[0, 1, 2]]
+    assert PPOSettings("ipo").domains_of_players(3) == [[0], [1], [2]]
+    assert PPOSettings("ensemble").domains_of_players(3) == [[0, 1, 2]] * 3
 
 
 @pytest.mark.parametrize(("method", "num_players"), [("ppo", 1), ("ipo", 3), ("ensemble", 3)])
 def test_three_domains(keys, method, num_players):
     domains = TabularDomains([keys[color] for color in ("red", "green", "blue")])
-    settings = Settings(method, **(SMALL | {"num_envs": 9, "num_updates": 1}))
+    settings = PPOSettings(method, **(SMALL | {"num_envs": 9, "num_updates": 1}))
     assert len(trained(domains, settings, [0], num_domains=3)) == num_players
 
 
@@ -232,17 +236,16 @@ def test_table_learns_what_images_learn(pair):
         def __call__(self, weights: Weights, indices: Tensor) -> tuple[Tensor, Tensor]:
             return super().__call__(weights, torch.tensor(pair.images)[indices])
 
-    settings, direct = Settings("ipo", **SMALL), OnImages()
-    *_, (_, slow) = train(direct, direct.start, pair, 2, settings, [0, 1])
+    settings = PPOSettings("ipo", **SMALL)
+    *_, (_, slow) = Training(OnImages(), pair, 2, settings, [0, 1]).reports()
     for ours, theirs in zip(trained(pair, settings, [0, 1]), slow, strict=True):
         for name, weight in theirs.items():
             assert_close(ours[name], weight.detach(), rtol=1e-7)
 
 
 def test_reports_count_frames_and_begin_before_training(pair):
-    settings = Settings("ipo", **SMALL)
-    network = double_on_table(pair)
-    reports = train(network, network.network.start, pair, 2, settings, [0])
+    settings = PPOSettings("ipo", **SMALL)
+    reports = Training(double_on_table(pair), pair, 2, settings, [0]).reports()
     frames, players = next(reports)
     draws = streams(0)[0]
     for player in players:
@@ -268,26 +271,32 @@ def random_frames(
     )
 
 
+class Nowhere:
+    """Environments in which nothing is collected."""
+
+    def reset(self) -> Tensor:
+        return torch.zeros(2, 4)
+
+
+def in_training(settings: PPOSettings, num_players: int = 1) -> Training:
+    """Two runs of players who learn from a table with five rows, with frames by hand."""
+    network = OnTable(DoubleNetwork(), torch.arange(5 * 147).reshape(5, 7, 7, 3) % 11)
+    return Training(network, lambda *_: Nowhere(), num_players, settings, [0, 1])
+
+
 def moved(
-    rollout: Rollout, settings: Settings, d: int = 0, num_players: int = 1
+    rollout: Rollout, settings: PPOSettings, d: int = 0, num_players: int = 1
 ) -> tuple[list[Weights], list[Weights]]:
     """All players before and after player d's move."""
-    network = OnTable(DoubleNetwork(), torch.arange(5 * 147).reshape(5, 7, 7, 3) % 11)
-    players = [
-        network.network.start([np.random.default_rng(10 * e + r) for r in range(2)])
-        for e in range(num_players)
-    ]
-    before = [{name: weight.clone() for name, weight in player.items()} for player in players]
-    own = [weight.requires_grad_() for weight in players[d].values()]
-    optimizer = torch.optim.Adam(own, settings.learning_rate)
-    orders = [np.random.default_rng(r) for r in range(2)]
-    improve(network, players, d, optimizer, rollout.frames(), settings, orders)
-    return before, [{n: w.detach() for n, w in player.items()} for player in players]
+    training = in_training(settings, num_players)
+    before = copied(training.players)
+    training.improve(d, rollout.frames())
+    return before, copied(training.players)
 
 
 def test_order_of_domains_in_a_rollout_does_not_matter():
     """With one minibatch for all frames, their order is nobody's business."""
-    settings = Settings("ppo", minibatch_size=24, num_steps=6)
+    settings = PPOSettings("ppo", minibatch_size=24, num_steps=6)
     rollout = random_frames()
     permuted = Rollout(*(x[:, [2, 3, 0, 1]] for x in rollout))
     for ours, theirs in zip(moved(rollout, settings)[1], moved(permuted, settings)[1], strict=True):
@@ -297,7 +306,7 @@ def test_order_of_domains_in_a_rollout_does_not_matter():
 
 @pytest.mark.parametrize("d", [0, 1, 2])
 def test_only_the_player_whose_turn_it_is_moves(d):
-    settings = Settings("ipo", minibatch_size=8, num_steps=6)
+    settings = PPOSettings("ipo", minibatch_size=8, num_steps=6)
     before, after = moved(random_frames(), settings, d, num_players=3)
     for e, (old, new) in enumerate(zip(before, after, strict=True)):
         same = [torch.equal(old[name], new[name]) for name in old]
@@ -334,34 +343,30 @@ def slow_advantages(rewards, values, next_values, ended, discount, gae_lambda) -
 def test_advantages_are_the_sum_by_hand(seed, num_steps, discount, gae_lambda):
     rng = np.random.default_rng(seed)
     shape = 2, 3, num_steps
-    rewards, values, later = (torch.tensor(rng.normal(size=shape)) for _ in range(3))
+    rewards = torch.tensor(rng.normal(size=shape))
+    values = torch.tensor(rng.normal(size=(2, 3, num_steps + 1)))
     ended = torch.tensor(rng.random(shape) < 0.3)
-    found = advantages(rewards, values, later, ended, discount, gae_lambda)
+    errors = value_errors(rewards, values, ended, discount)
+    found = advantages(errors, ended, discount * gae_lambda)
     for place in np.ndindex(2, 3):
-        rows = (x[place].tolist() for x in (rewards, values, later, ended))
+        rows = (x[place].tolist() for x in (rewards, values[..., :-1], values[..., 1:], ended))
         slow = slow_advantages(*rows, discount, gae_lambda)
         assert found[place].tolist() == pytest.approx(slow, rel=1e-10, abs=1e-12)
 
 
 def test_advantages_of_three_steps_by_hand():
     """gamma = 1/2, lambda = 1/2; the second step ends an episode."""
-    rewards, values = torch.tensor([0.0, 1.0, 0.0]), torch.tensor([2.0, 4.0, 8.0])
-    found = advantages(
-        rewards,
-        values,
-        torch.tensor([4.0, 8.0, 16.0]),
-        torch.tensor([False, True, False]),
-        0.5,
-        0.5,
-    )
-    # deltas: 0 + 2 - 2 = 0, 1 - 4 = -3, 0 + 8 - 8 = 0; only the first looks at the second.
-    assert found.tolist() == [-0.75, -3.0, 0.0]
+    rewards, values = torch.tensor([0.0, 1.0, 0.0]), torch.tensor([2.0, 4.0, 8.0, 16.0])
+    ended = torch.tensor([False, True, False])
+    errors = value_errors(rewards, values, ended, 0.5)
+    assert errors.tolist() == [0 + 2 - 2, 1 - 4, 0 + 8 - 8]
+    assert advantages(errors, ended, 0.25).tolist() == [-0.75, -3.0, 0.0]
 
 
 def test_full_lambda_is_the_discounted_sum_of_rewards_less_the_value():
-    rewards, values = torch.tensor([1.0, 2.0, 3.0]), torch.tensor([5.0, 6.0, 7.0])
+    rewards, values = torch.tensor([1.0, 2.0, 3.0]), torch.tensor([5.0, 6.0, 7.0, 99.0])
     ended = torch.tensor([False, False, True])
-    found = advantages(rewards, values, torch.tensor([6.0, 7.0, 99.0]), ended, 0.5, 1.0)
+    found = advantages(value_errors(rewards, values, ended, 0.5), ended, 0.5)
     assert found.tolist() == [1 + 1 + 0.75 - 5, 2 + 1.5 - 6, 3 - 7]
 
 
@@ -396,20 +401,10 @@ def scripted_policy(observation: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def scripted_rollout(ends: Sequence[str], time_outs: str) -> tuple[Rollout, Tensor]:
-    environments = Script(ends)
-    first = environments.reset()
-    return collect(
-        scripted_policy,
-        Categorical,
-        environments,
-        first,
-        num_steps=len(ends),
-        generators=[np.random.default_rng(0)],
-        normalizer=None,
-        discount=0.5,
-        gae_lambda=0.0,  # advantages are deltas
-        time_outs=time_outs,
-    )
+    """With lambda = 0: advantages are deltas. Also what is seen after it."""
+    collector = Collector(Script(ends), len(ends), 0.5, 0.0, time_outs)
+    rollout = collector.collect(scripted_policy, Categorical, [np.random.default_rng(0)])
+    return rollout, collector.observation
 
 
 @pytest.mark.parametrize(
@@ -484,7 +479,7 @@ def test_entropy_of_equal_probabilities():
 # --------------------------------------------------------------------------------- loss
 
 
-def slow_loss(logits, values, batch: Rollout, s: Settings, run: int) -> float:
+def slow_loss(logits, values, batch: Rollout, s: PPOSettings, run: int) -> float:
     """Frame by frame, in numbers of Python."""
     frames = range(values.shape[1])
     gains = [float(batch.advantages[run, i]) for i in frames]
@@ -517,7 +512,7 @@ def slow_loss(logits, values, batch: Rollout, s: Settings, run: int) -> float:
     normalize=st.sampled_from(["none", "minibatch"]),
 )
 def test_loss_is_that_by_hand(seed, clip, entropy_weight, value_weight, normalize):
-    settings = Settings(
+    settings = PPOSettings(
         "ppo",
         clip=clip,
         entropy_weight=entropy_weight,
@@ -554,7 +549,7 @@ def test_clipped_objective_by_hand(ratio, gain, expected):
         advantages=gain * one,
         returns=one,
     )
-    settings = Settings("ppo", clip=0.2, entropy_weight=0.0, value_weight=0.0)
+    settings = PPOSettings("ppo", clip=0.2, entropy_weight=0.0, value_weight=0.0)
     loss = clipped_loss(Categorical, torch.zeros(1, 1, 2).double(), one, batch, settings)
     assert loss.tolist() == pytest.approx([expected])
 
@@ -572,7 +567,7 @@ def test_clipped_error_of_the_value_by_hand(value, expected):
     one = torch.ones(1, 1, dtype=torch.float64)
     zero = torch.zeros(1, 1, dtype=torch.float64)
     batch = Rollout(one, one.long(), zero, one, zero, 3 * one)
-    settings = Settings("ppo", clip=0.2, entropy_weight=0.0, value_weight=1.0)
+    settings = PPOSettings("ppo", clip=0.2, entropy_weight=0.0, value_weight=1.0)
     loss = clipped_loss(Categorical, torch.zeros(1, 1, 2).double(), value * one, batch, settings)
     assert loss.tolist() == pytest.approx([expected])
 
@@ -584,7 +579,7 @@ def test_gradient_is_zero_where_the_ratio_is_clipped():
         log_probabilities=torch.full((2, 5), math.log(1 / 7 / 1.5)).double(),
         advantages=batch.advantages.abs(),
     )
-    settings = Settings("ppo", entropy_weight=0.0, value_weight=0.0)
+    settings = PPOSettings("ppo", entropy_weight=0.0, value_weight=0.0)
     clipped_loss(Categorical, logits, batch.values, batch, settings).sum().backward()
     assert not logits.grad.any()
 
@@ -621,7 +616,7 @@ def test_no_gradient_stays_no_gradient():
 def test_minibatches_are_a_partition(seed, num_copies, num_steps, skip, data):
     num_frames = num_copies * num_steps
     size = data.draw(st.integers(1, num_frames))
-    settings = Settings("ppo", num_steps=num_steps, minibatch_size=size)
+    settings = PPOSettings("ppo", num_steps=num_steps, minibatch_size=size)
     frames = random_frames(num_runs=3, num_copies=num_copies, num_steps=num_steps).frames()
     generators = [np.random.default_rng([seed, run]) for run in range(3)]
     batches = list(minibatches(frames, settings, generators, skip))
@@ -633,7 +628,7 @@ def test_minibatches_are_a_partition(seed, num_copies, num_steps, skip, data):
 
 
 def test_runs_have_orders_of_their_own():
-    settings = Settings("ppo", num_steps=10, minibatch_size=40)
+    settings = PPOSettings("ppo", num_steps=10, minibatch_size=40)
     frames = random_frames(num_steps=10).frames()
     (order,) = minibatches(frames, settings, [np.random.default_rng(r) for r in range(2)], False)
     assert not torch.equal(order[0], order[1])
@@ -650,7 +645,7 @@ def test_every_second_epoch_leaves_out_the_last_frames(num_epochs):
     rollout = random_frames()
     rollout.advantages[..., :-1] = 0
     rollout = rollout._replace(returns=rollout.values + rollout.advantages)
-    settings = Settings(
+    settings = PPOSettings(
         "ppo",
         num_steps=6,
         minibatch_size=24,
@@ -666,11 +661,9 @@ def test_every_second_epoch_leaves_out_the_last_frames(num_epochs):
             super().step()
 
     norms: list[float] = []
-    network = OnTable(DoubleNetwork(), torch.arange(5 * 147).reshape(5, 7, 7, 3) % 11)
-    player = network.network.start([np.random.default_rng(r) for r in range(2)])
-    optimizer = Watched([weight.requires_grad_() for weight in player.values()], 1e-9)
-    orders = [np.random.default_rng(r) for r in range(2)]
-    improve(network, [player], 0, optimizer, rollout.frames(), settings, orders)
+    training = in_training(settings)
+    training.optimizers[0] = Watched(list(training.players[0].values()), 1e-9)
+    training.improve(0, rollout.frames())
     assert [norm > 0 for norm in norms] == [True, False, True, False][:num_epochs]
 
 
@@ -709,8 +702,8 @@ def test_published_settings_with_changes():
 
 
 def test_time_outs_are_no_ends_by_default():
-    assert Settings("ppo").time_outs == "bootstrap"
-    assert not Settings("ppo").skip_last_frames
+    assert PPOSettings("ppo").time_outs == "bootstrap"
+    assert not PPOSettings("ppo").skip_last_frames
 
 
 # ----------------------------------------------------------------------------- learning
@@ -729,8 +722,8 @@ def test_a_known_small_task_is_learned_to_its_optimum(method):
     assert best == pytest.approx(1 - 0.9 * 5 / 100)
     domains = TabularDomains([task, task])
     network = OnTable(GridNetwork(), torch.tensor(domains.images).float())
-    settings, seeds = Settings(method, num_updates=10), list(range(10))
-    *_, (_, players) = train(network, network.network.start, domains, 2, settings, seeds)
+    settings, seeds = PPOSettings(method, num_updates=10), list(range(10))
+    *_, (_, players) = Training(network, domains, 2, settings, seeds).reports()
     logits = network.average(players)[0][:, domains.observation_of[0]]
     greedy = np.eye(7)[Categorical.mode(logits).numpy()]
     drawn, success = expected_return(task, logits.softmax(-1).numpy())
@@ -748,8 +741,8 @@ def test_a_known_small_task_is_learned_over_gymnasium():
     def make(domains: list[int], num_copies: list[int], generators: Sequence) -> FromGymnasium:
         return FromGymnasium(SyncVectorEnv(makers, autoreset_mode=AutoresetMode.SAME_STEP), 1, 0)
 
-    settings = Settings("ppo", num_envs=16, num_updates=20)
-    *_, (_, players) = train(network, network.start, make, 1, settings, [0])
+    settings = PPOSettings("ppo", num_envs=16, num_updates=20)
+    *_, (_, players) = Training(network, make, 1, settings, [0]).reports()
     logits, _ = network.frozen(players)(torch.tensor(task.images).float()[None])
     returns, _ = expected_return(task, logits.softmax(-1).numpy())
     assert returns[0] > 0.95 * optimal_policy(task)[1]

@@ -14,7 +14,7 @@ from ipo.causality.scalar_control import (
     training_cost,
     unseen_cost,
 )
-from ipo.causality.vector_game import Settings, last, wishes
+from ipo.causality.small_games import GameSettings, downhill, last
 from ipo.game import average
 
 
@@ -94,7 +94,7 @@ TABLE = [
 @pytest.mark.parametrize(("betas", "label", "expected", "training", "elsewhere"), TABLE)
 def test_table_of_the_book(betas, label, expected, training, elsewhere):
     rule = standard(len(betas))[label]
-    rule = Settings(**(vars(rule) | {"num_rounds": 4000 if label == "ipo_bound5" else 2000}))
+    rule = GameSettings(**(vars(rule) | {"num_rounds": 4000 if label == "ipo_bound5" else 2000}))
     gains = average(last(costs(double([betas])), double([START]), rule))[0]
     assert gains.tolist() == pytest.approx(expected, abs=6e-4)
     own = stationary_cost(gains, double(betas)).mean()
@@ -105,7 +105,7 @@ def test_table_of_the_book(betas, label, expected, training, elsewhere):
 
 @pytest.mark.parametrize("start", [(0.3, 0.1), (0.1, -0.2), (0.5, 0.3)])
 def test_bounded_players_find_the_invariant_controller_from_everywhere(start):
-    rule = Settings("ipo", learning_rate=0.2, num_rounds=2000, bound=2.0, max_gradient_norm=1.0)
+    rule = GameSettings("ipo", learning_rate=0.2, num_rounds=2000, bound=2.0, max_gradient_norm=1.0)
     players = last(costs(double([[1.0, -0.2]])), double([start]), rule)
     assert_near(average(players)[0], invariant_gains(), atol=1e-6)
 
@@ -113,11 +113,11 @@ def test_bounded_players_find_the_invariant_controller_from_everywhere(start):
 def test_with_three_domains_each_gain_is_decided_by_another_one():
     """The vote, gain by gain: nobody's own optimum comes out, the median domain's neither."""
     betas = (1.0, 0.2, -0.5)
-    rule = Settings("ipo", learning_rate=0.3, num_rounds=2500, bound=2.0, max_gradient_norm=1.0)
+    rule = GameSettings("ipo", learning_rate=0.3, num_rounds=2500, bound=2.0, max_gradient_norm=1.0)
     players = last(costs(double([betas])), double([START]), rule)
-    contents = wishes(costs(double([betas])), average(players))[0].abs() < 1e-6
+    contents = downhill(costs(double([betas])), average(players))[0].abs() < 1e-6
     assert contents.tolist() == [[False, True], [True, False], [False, False]]
-    alone = last(costs(double([[0.2]])), double([START]), Settings("pooled", num_rounds=2000))
+    alone = last(costs(double([[0.2]])), double([START]), GameSettings("pooled", num_rounds=2000))
     assert float((average(players) - average(alone)).norm()) > 1
 
 
@@ -137,7 +137,7 @@ def test_families_of_problems():
 
 
 def test_rows_hold_the_gains_of_every_problem_in_order():
-    rule = Settings("pooled", num_rounds=20)
+    rule = GameSettings("pooled", num_rounds=20)
     cell = Cell("pooled", rule, (None, None), "random")
     rows = run_cell(cell, [5, 3])
     assert_close(

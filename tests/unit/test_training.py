@@ -9,11 +9,10 @@ import torch
 from gymnasium.vector import AutoresetMode
 from torch import Tensor
 
-from ipo.dense_network import DenseNetwork
 from ipo.distributions import Gaussian
-from ipo.ppo import Settings, Training, train
-from ipo.rollouts import RewardNormalizer, Step, advantages, collect
-from ipo.vector_environments import FromGymnasium
+from ipo.networks import DenseNetwork, copied
+from ipo.ppo import PPOSettings, Training
+from ipo.rollouts import Collector, FromGymnasium, RewardNormalizer, Step
 
 SMALL = {"num_envs": 4, "num_steps": 16, "minibatch_size": 16, "num_updates": 4, "num_epochs": 2}
 
@@ -50,8 +49,8 @@ def counting(domains, num_copies, generators):
 NETWORK = DenseNetwork(1, 1, hidden=(8,))
 
 
-def trainings(settings: Settings, seeds=(0, 1)) -> Training:
-    return Training(NETWORK, NETWORK.start, counting, 2, settings, list(seeds))
+def trainings(settings: PPOSettings, seeds=(0, 1)) -> Training:
+    return Training(NETWORK, counting, 2, settings, list(seeds))
 
 
 # --------------------------------------------------------------------------------- rollouts
@@ -63,21 +62,10 @@ def policy(observation: Tensor) -> tuple[Tensor, Tensor]:
     return torch.cat([zero, zero + 1], -1), zero.squeeze(-1) + 10
 
 
-def rollout(time_outs: str):
-    environments = Counting(1, 2, horizon=3)
-    found, _ = collect(
-        policy,
-        Gaussian,
-        environments,
-        environments.reset(),
-        num_steps=4,
-        generators=[np.random.default_rng(0)],
-        normalizer=None,
-        discount=0.5,
-        gae_lambda=0.0,  # A_t = delta_t
-        time_outs=time_outs,
-    )
-    return found
+def rollout(time_outs: str, gae_lambda: float = 0.0):
+    """By default A_t = delta_t."""
+    collector = Collector(Counting(1, 2, horizon=3), 4, 0.5, gae_lambda, time_outs)
+    return collector.collect(policy, Gaussian, [np.random.default_rng(0)])
 
 
 @pytest.mark.parametrize(
@@ -100,12 +88,13 @@ def test_what_a_time_out_is_worth(time_outs, at_the_time_out):
 
 
 def test_no_advantage_flows_over_a_step_that_is_left_out():
-    ended = torch.tensor([[False, True, False]])
-    rewards, values = torch.tensor([[1.0, 2.0, 4.0]]), torch.tensor([[10.0, 20.0, 30.0]])
-    next_values = torch.tensor([[20.0, 30.0, 40.0]])
-    found = advantages(rewards, values, next_values, ended, 0.5, 0.5, without=ended)
-    last = 4 + 0.5 * 40 - 30
-    torch.testing.assert_close(found, torch.tensor([[1 + 0.5 * 20 - 10, 0.0, last]]))
+    """The third step of four is the time-out; the last has only its own error."""
+    found = rollout("no_advantage", gae_lambda=0.5)
+    errors = found.actions.squeeze(-1) + 0.5 * 10 - 10
+    expected = errors.clone()
+    expected[..., 0] += 0.25 * errors[..., 1]
+    expected[..., 2] = 0.0
+    torch.testing.assert_close(found.advantages, expected)
 
 
 # ------------------------------------------------------------------------ normalised rewards
@@ -154,11 +143,11 @@ def test_rewards_are_normalised_as_step_by_step_and_piece_by_piece():
     ],
 )
 def test_copies_are_shared_among_players(method, num_envs, copies):
-    assert Settings(method, num_envs=num_envs).copies_of_players(2) == copies
+    assert PPOSettings(method, num_envs=num_envs).copies_of_players(2) == copies
 
 
 def test_players_with_unequal_rollouts_make_the_same_number_of_steps():
-    settings = Settings("ipo", **(SMALL | {"num_envs": (3, 1), "num_minibatches": 8}))
+    settings = PPOSettings("ipo", **(SMALL | {"num_envs": (3, 1), "num_minibatches": 8}))
     assert settings.size_of_minibatches(3 * 16) == 6
     assert settings.size_of_minibatches(1 * 16) == 2
     training = trainings(settings)
@@ -186,7 +175,7 @@ def test_players_with_unequal_rollouts_make_the_same_number_of_steps():
 )
 def test_settings_that_make_no_sense_are_refused(change, error):
     with pytest.raises(ValueError, match=error):
-        trainings(Settings("ipo", **(SMALL | change)))
+        trainings(PPOSettings("ipo", **(SMALL | change)))
 
 
 # ------------------------------------------------------------------------------ going on
@@ -199,7 +188,7 @@ def flat(training: Training) -> Tensor:
 @pytest.mark.parametrize("method", ["ppo", "ipo", "ensemble"])
 def test_a_restored_training_goes_on_as_if_nothing_had_happened(method):
     changes = {"normalize_rewards": True, "normalize_advantages": "rollout", "num_steps": 18}
-    settings = Settings(method, **(SMALL | changes))
+    settings = PPOSettings(method, **(SMALL | changes))
     whole = trainings(settings)
     for _ in range(4):
         whole.update()
@@ -215,19 +204,51 @@ def test_a_restored_training_goes_on_as_if_nothing_had_happened(method):
     assert not torch.equal(flat(first), flat(whole))
 
 
+@pytest.mark.parametrize("d", [0, 1])
+def test_a_player_who_goes_on_alone_collects_and_learns_alone(d):
+    settings = PPOSettings("ipo", **(SMALL | {"num_steps": 18}))
+    training = trainings(settings)
+    training.update()
+    before, seen = copied(training.players), [own.observation for own in training.collectors]
+    training.update(only=d)
+    for e, (old, new) in enumerate(zip(before, training.players, strict=True)):
+        assert all(torch.equal(old[name], new[name]) for name in old) == (e != d)
+    moved = [own.observation is not o for own, o in zip(training.collectors, seen, strict=True)]
+    assert moved == [e == d for e in range(2)]
+    assert training.num_frames == (4 + 2) * 18
+
+
+def test_a_round_is_a_move_of_every_player_in_turn():
+    settings = PPOSettings("ipo", **SMALL)
+    together, in_turn = trainings(settings), trainings(settings)
+    together.update()
+    for d in range(2):
+        in_turn.update(only=d)
+    assert torch.equal(flat(together), flat(in_turn))
+
+
+def test_training_goes_on_from_other_players():
+    settings = PPOSettings("ipo", **SMALL)
+    training, other = trainings(settings), trainings(settings, (2, 3))
+    training.set_players(other.players)
+    assert torch.equal(flat(training), flat(other))
+    training.update()
+    assert not torch.equal(flat(training), flat(other))
+
+
 def test_training_raises_what_is_rewarded():
     """The reward is the action: means must grow."""
-    settings = Settings(
+    settings = PPOSettings(
         "ipo",
         **(SMALL | {"num_updates": 20, "learning_rate": 0.01, "normalize_advantages": "rollout"}),
     )
-    *_, (_, players) = train(NETWORK, NETWORK.start, counting, 2, settings, [0, 1])
+    *_, (_, players) = trainings(settings).reports()
     mean = NETWORK.frozen(players)(torch.ones(2, 1, 1))[0][..., 0]
     assert (mean > 0.5).all()
 
 
 def test_runs_do_not_mix():
-    settings = Settings("ipo", **SMALL)
+    settings = PPOSettings("ipo", **SMALL)
     together = trainings(settings, (0, 1))
     alone = trainings(settings, (1,))
     for training in (together, alone):

@@ -10,8 +10,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 from small import assert_close, assert_near
 
-from ipo.causality.linear_game import Regression, correlated_noise, effect_of_target, irm_v1
-from ipo.causality.vector_game import Settings, gap, last, play, residual, vote, wishes
+from ipo.causality.predictors import PredictorSettings, Regression, irm_objective
+from ipo.causality.small_games import (
+    GameSettings,
+    correlated_noise,
+    downhill,
+    effect_of_target,
+    gap,
+    last,
+    play,
+    residual,
+    vote,
+)
 from ipo.game import average
 
 coefficients = st.lists(st.integers(-10, 10), min_size=2, max_size=5).map(
@@ -39,21 +49,21 @@ def double(values) -> torch.Tensor:
 def test_one_round_by_hand(order, expected):
     """J_d = (p - t_d)^2 / 2 with t = 1, 3; player 2 sees p = 1/4 in turn, and 0 together."""
     targets = [lambda w, t=t: 0.5 * (w[:, 0] - t) ** 2 for t in (1.0, 3.0)]
-    rule = Settings("ipo", learning_rate=1.0, num_rounds=1, order=order)
+    rule = GameSettings("ipo", learning_rate=1.0, num_rounds=1, order=order)
     players = last(targets, double([[0.0]]), rule)
     assert players.flatten().tolist() == expected
 
 
 def test_bounded_players_are_put_back():
     targets = [lambda w, t=t: 0.5 * (w[:, 0] - t) ** 2 for t in (10.0, -10.0)]
-    rule = Settings("ipo", learning_rate=10.0, num_rounds=3, bound=0.5)
+    rule = GameSettings("ipo", learning_rate=10.0, num_rounds=3, bound=0.5)
     assert last(targets, double([[0.0]]), rule).flatten().tolist() == [0.5, -0.5]
 
 
 def test_players_may_start_apart_and_start_is_kept():
     problem = correlated_noise(double([[0.5, -0.5]]))
     start = double([[[1.0, 2.0], [3.0, 4.0]]])
-    (number, players), *_ = play(problem.costs, start, Settings("ipo", num_rounds=2), [0])
+    (number, players), *_ = play(problem.costs, start, GameSettings("ipo", num_rounds=2), [0])
     assert number == 0
     assert torch.equal(players, start)
 
@@ -61,20 +71,20 @@ def test_players_may_start_apart_and_start_is_kept():
 @pytest.mark.parametrize("method", ["pooled", "ensemble"])
 def test_players_that_own_all_domains_find_pooled_least_squares(method):
     problem = effect_of_target(double([[1.0, -0.4, 0.3]]))
-    rule = Settings(method, learning_rate=0.3, num_rounds=2000)
+    rule = GameSettings(method, learning_rate=0.3, num_rounds=2000)
     assert_close(average(last(problem.costs, double([[0.0, 0.0]]), rule)), problem.pooled())
 
 
 def test_separate_players_find_their_own_optima():
     problem = effect_of_target(double([[1.0, -0.4, 0.3]]))
-    players = last(problem.costs, double([[0.0, 0.0]]), Settings("separate", num_rounds=3000))
+    players = last(problem.costs, double([[0.0, 0.0]]), GameSettings("separate", num_rounds=3000))
     assert_close(players, problem.optima)
 
 
 @pytest.mark.parametrize("order", ["in_turn", "together"])
 def test_problems_do_not_interact(order):
     rho = double([[0.8, -0.4], [0.9, 0.5], [-0.3, 0.1]])
-    rule = Settings("ipo", "adam", learning_rate=0.01, num_rounds=50, order=order)
+    rule = GameSettings("ipo", "adam", learning_rate=0.01, num_rounds=50, order=order)
     together = last(correlated_noise(rho).costs, torch.zeros(3, 2).double(), rule)
     for r in range(3):
         alone = last(correlated_noise(rho[r : r + 1]).costs, torch.zeros(1, 2).double(), rule)
@@ -88,8 +98,8 @@ def test_problems_do_not_interact(order):
 def test_together_plain_steps_are_pooled_gradient_descent(num_domains):
     problem = effect_of_target(double([np.linspace(-0.5, 1, num_domains).tolist()]))
     start = double([[0.2, 0.1]])
-    pooled = Settings("pooled", learning_rate=0.05, num_rounds=40)
-    game = Settings("ipo", learning_rate=0.05 * num_domains, num_rounds=40, order="together")
+    pooled = GameSettings("pooled", learning_rate=0.05, num_rounds=40)
+    game = GameSettings("ipo", learning_rate=0.05 * num_domains, num_rounds=40, order="together")
     assert_close(
         average(last(problem.costs, start, game)), average(last(problem.costs, start, pooled))
     )
@@ -101,8 +111,8 @@ def test_in_turn_the_difference_is_of_first_order():
     errors = []
     for eta in (0.02, 0.01, 0.005):
         num_rounds = round(1 / eta)
-        pooled = last(problem.costs, start, Settings("pooled", "plain", eta, num_rounds))
-        game = last(problem.costs, start, Settings("ipo", "plain", 2 * eta, num_rounds))
+        pooled = last(problem.costs, start, GameSettings("pooled", "plain", eta, num_rounds))
+        game = last(problem.costs, start, GameSettings("ipo", "plain", 2 * eta, num_rounds))
         errors.append(float((average(game) - average(pooled)).norm()))
     ratios = [a / b for a, b in itertools.pairwise(errors)]
     assert all(1.8 < ratio < 2.2 for ratio in ratios), ratios
@@ -111,13 +121,13 @@ def test_in_turn_the_difference_is_of_first_order():
 def test_without_bounds_players_drift_at_constant_speed_and_cancel():
     """At the pooled optimum 0.2 player d moves by eta (rho_d - 0.2) in every round, for ever."""
     problem = correlated_noise(double([[0.8, -0.4]]))
-    rule = Settings("ipo", learning_rate=0.1, num_rounds=1500)
+    rule = GameSettings("ipo", learning_rate=0.1, num_rounds=1500)
     (_, early), (_, late) = play(problem.costs, double([[1.0, 0.0]]), rule, [500])
     drift = (late - early)[0, :, 1]
     # 1000 rounds of 0.1 * 0.6, up to the first order of moving in turn
     assert_near(drift.sum(), double(0.0), atol=1e-9)
     assert float(drift[0]) == pytest.approx(60, rel=0.06)
-    assert float(gap(problem.costs, late, Settings("pooled", learning_rate=1.0))) > 0.3
+    assert float(gap(problem.costs, late, GameSettings("pooled", learning_rate=1.0))) > 0.3
 
 
 # --------------------------------------------------------------------------------- the vote
@@ -145,7 +155,7 @@ def test_bounded_players_end_at_the_vote(optima, bound, seed):
     """Whatever the curvatures: how much a domain cares has no influence."""
     curvature = double(np.random.default_rng(seed).uniform(0.5, 2.0, len(optima)))
     problem = separable(double(optima)[None, :, None], curvature[None, :, None])
-    rule = Settings("ipo", learning_rate=0.5 * len(optima), num_rounds=400, bound=bound)
+    rule = GameSettings("ipo", learning_rate=0.5 * len(optima), num_rounds=400, bound=bound)
     players = last(problem.costs, double([[0.0]]), rule)
     if float(residual(problem.costs, players, bound)) < 1e-9:  # else still on their way
         assert_near(average(players), vote(problem.optima, bound), atol=1e-7)
@@ -182,7 +192,7 @@ def test_the_vote_does_not_depend_on_the_order_of_the_domains(optima, seed):
 @pytest.mark.parametrize("order", list(itertools.permutations(range(3))))
 def test_together_the_order_of_players_does_not_matter(optimizer, order):
     spurious = double([[0.9, -0.2, 0.4]])
-    rule = Settings("ipo", optimizer, 0.02, num_rounds=200, bound=1.0, order="together")
+    rule = GameSettings("ipo", optimizer, 0.02, num_rounds=200, bound=1.0, order="together")
     start = double([[0.0, 0.0]])
     players = last(effect_of_target(spurious).costs, start, rule)
     permuted = last(effect_of_target(spurious[:, list(order)]).costs, start, rule)
@@ -192,7 +202,7 @@ def test_together_the_order_of_players_does_not_matter(optimizer, order):
 @pytest.mark.parametrize("order", list(itertools.permutations(range(3))))
 def test_in_turn_bounded_players_end_at_the_same_average_in_any_order(order):
     spurious = double([[0.9, -0.2, 0.4]])
-    rule = Settings("ipo", learning_rate=1.0, num_rounds=2000, bound=2.0)
+    rule = GameSettings("ipo", learning_rate=1.0, num_rounds=2000, bound=2.0)
     players = last(correlated_noise(spurious[:, list(order)]).costs, double([[0.0, 0.0]]), rule)
     assert_near(average(players), double([[1.0, 0.4]]), atol=1e-9)
 
@@ -200,7 +210,7 @@ def test_in_turn_bounded_players_end_at_the_same_average_in_any_order(order):
 @pytest.mark.parametrize("spurious", [(1.0, -0.4), (0.3, -2.0), (1.0, 0.5, -0.3, -0.7)])
 def test_an_effect_is_ignored_where_signs_draw_even_though_features_are_correlated(spurious):
     problem = effect_of_target(double([spurious]), causal=0.7)
-    rule = Settings("ipo", learning_rate=1.0, num_rounds=1500, bound=1.5)
+    rule = GameSettings("ipo", learning_rate=1.0, num_rounds=1500, bound=1.5)
     players = last(problem.costs, double([[0.1, 0.2]]), rule)
     assert_near(average(players), double([[0.7, 0.0]]), atol=1e-7)
     assert float(gap(problem.costs, players, replace(rule, method="pooled"))) < 1e-9
@@ -209,7 +219,7 @@ def test_an_effect_is_ignored_where_signs_draw_even_though_features_are_correlat
 def test_the_weight_of_a_domain_does_not_matter_to_bounded_players():
     costs = correlated_noise(double([[0.8, -0.4]])).costs
     heavy = [costs[0], lambda w: 50 * costs[1](w)]
-    rule = Settings("ipo", learning_rate=0.05, num_rounds=4000, bound=0.5)
+    rule = GameSettings("ipo", learning_rate=0.05, num_rounds=4000, bound=0.5)
     start = double([[1.0, 0.0]])
     start[:, 0] = 0.5
     for objectives in (costs, heavy):
@@ -220,8 +230,8 @@ def test_adam_stays_where_the_votes_are_even_and_bounds_do_not():
     """The book's correction of a tempting conclusion: Adam does not choose zero by itself."""
     costs = correlated_noise(double([[0.8, -0.8]])).costs
     start = double([[1.0, 0.3]])
-    adam = Settings("ipo", "adam", learning_rate=1e-3, num_rounds=3000)
-    bounded = Settings("ipo", learning_rate=0.5, num_rounds=3000, bound=2.0)
+    adam = GameSettings("ipo", "adam", learning_rate=1e-3, num_rounds=3000)
+    bounded = GameSettings("ipo", learning_rate=0.5, num_rounds=3000, bound=2.0)
     assert float(average(last(costs, start, adam))[0, 1]) == pytest.approx(0.3, abs=0.02)
     assert float(average(last(costs, start, bounded))[0, 1]) == pytest.approx(0.0, abs=1e-9)
 
@@ -251,7 +261,7 @@ def test_invariant_predictor_has_the_same_slope_everywhere():
     for cost in problem.costs:
         assert float(cost(double([[0.8, 0.0]]))) == pytest.approx(1.0)  # the noise of y
     # and the gradient of the causal weight vanishes there in every domain
-    assert_close(wishes(problem.costs, double([[0.8, 0.0]]))[..., 0], double([[0.0, 0.0]]))
+    assert_close(downhill(problem.costs, double([[0.8, 0.0]]))[..., 0], double([[0.0, 0.0]]))
 
 
 def test_pooled_least_squares_weighs_by_shares():
@@ -266,7 +276,8 @@ def test_irm_penalty_against_a_numerical_derivative():
     slopes = [(cost(w * (1 + step)) - cost(w * (1 - step))) / (2 * step) for cost in problem.costs]
     risks = [cost(w) for cost in problem.costs]
     expected = sum(r + 7.0 * s**2 for r, s in zip(risks, slopes, strict=True)) / 2
-    assert_close(irm_v1(problem, 7.0)(w), expected, rtol=1e-7)
+    objective = irm_objective(problem, PredictorSettings(penalty=7.0), w.unsqueeze(-1))
+    assert_close(objective, expected, rtol=1e-7)
 
 
 # --------------------------------------------------------------------------------- bad input
@@ -275,18 +286,18 @@ def test_irm_penalty_against_a_numerical_derivative():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: Settings("poled"), "method = 'poled'.*did you mean 'pooled'"),
-        (lambda: Settings("ipo", "sgd"), "optimizer = 'sgd'"),
-        (lambda: Settings("ipo", bound=0.0), "bound = 0.0: must be greater than 0"),
-        (lambda: Settings("ipo", bound=-1.0), "bound = -1.0"),
-        (lambda: Settings("ipo", learning_rate=0.0), "learning_rate = 0.0"),
-        (lambda: Settings("ipo", num_rounds=-1), "num_rounds = -1: must be at least 0"),
-        (lambda: Settings("ipo", order="random"), "order = 'random'"),
-        (lambda: Settings("ipo", max_gradient_norm=0), "max_gradient_norm = 0"),
-        (lambda: last([], double([[0.0]]), Settings("ipo")), "no domain"),
-        (lambda: last([torch.sum], double([[np.nan]]), Settings("ipo")), "start: holds NaN"),
+        (lambda: GameSettings("poled"), "method = 'poled'.*did you mean 'pooled'"),
+        (lambda: GameSettings("ipo", "sgd"), "optimizer = 'sgd'"),
+        (lambda: GameSettings("ipo", bound=0.0), "bound = 0.0: must be greater than 0"),
+        (lambda: GameSettings("ipo", bound=-1.0), "bound = -1.0"),
+        (lambda: GameSettings("ipo", learning_rate=0.0), "learning_rate = 0.0"),
+        (lambda: GameSettings("ipo", num_rounds=-1), "num_rounds = -1: must be at least 0"),
+        (lambda: GameSettings("ipo", order="random"), "order = 'random'"),
+        (lambda: GameSettings("ipo", max_gradient_norm=0), "max_gradient_norm = 0"),
+        (lambda: last([], double([[0.0]]), GameSettings("ipo")), "no domain"),
+        (lambda: last([torch.sum], double([[np.nan]]), GameSettings("ipo")), "start: holds NaN"),
         (
-            lambda: last([lambda w: w.sum(1) / 0], double([[1.0]]), Settings("ipo")),
+            lambda: last([lambda w: w.sum(1) / 0], double([[1.0]]), GameSettings("ipo")),
             "infinitely much in domain 0",
         ),
         (lambda: vote(double([[1.0]]), 0.0), "bound = 0.0"),
@@ -298,8 +309,8 @@ def test_irm_penalty_against_a_numerical_derivative():
         (lambda: correlated_noise(double([[0.5, 0.1]])).pooled([1]), "one for each domain"),
         (lambda: correlated_noise(double([[0.5, 0.1]])).pooled([1, 0]), r"shares\[1\] = 0"),
         (
-            lambda: irm_v1(correlated_noise(double([[0.5, 0.1]])), -1.0),
-            "penalty_weight = -1.0: must be at least 0",
+            lambda: last([torch.sum] * 2, double([[[0.0]] * 3]), GameSettings("ipo")),
+            "start: is of 3 players, must be of 2",
         ),
     ],
 )

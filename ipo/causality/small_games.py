@@ -1,30 +1,41 @@
-"""The game between players whose policies are short vectors, for many problems at once.
+"""Games of two numbers, or few: players whose policies are short vectors, many problems at once.
 
 Everything that the book says about what the game does in principle is checked here: a policy is
-``w [R, P]``, R problems with P weights each, and a domain is a cost ``J_d(w) [R]``. Rounds and
-averages are those of :mod:`ipo.game`, optimisers those of :mod:`ipo.optimizers`.
+``w [R, P]``, R problems with P weights each, and a domain is a cost ``J_d(w) [R]``.
+
+The domains of the book's example are linear regressions with a causal feature and a spurious one,
+
+    y = c x_1 + e,        x_1, e ~ N(0, 1) independent,        J_d(w) = E (y - w_1 x_1 - w_2 x_2)^2
+
+``x_2`` is related to y differently in every domain, so ``w = (c, 0)`` is the invariant predictor.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
+from ipo.causality.predictors import Regression
 from ipo.checks import check_choice, check_count, check_number
-from ipo.game import average, best_response_round, nash_gap, new_players, split_players
-from ipo.optimizers import descend, make_optimizer
+from ipo.game import (
+    ORDERS,
+    OWNERSHIPS,
+    Cost,
+    LinearPlayers,
+    average,
+    domains_of_players,
+    nash_gap,
+)
+from ipo.optimizers import make_optimizer
 
-METHODS = ("pooled", "ipo", "ensemble", "separate")
-ORDERS = ("in_turn", "together")
-
-Cost = Callable[[Tensor], Tensor]
+GAME_METHODS = (*OWNERSHIPS, "separate")
 
 
 @dataclass(frozen=True)
-class Settings:
+class GameSettings:
     """How the players move.
 
     Attributes:
@@ -48,7 +59,7 @@ class Settings:
     max_gradient_norm: float | None = None
 
     def __post_init__(self) -> None:
-        check_choice("method", self.method, METHODS)
+        check_choice("method", self.method, GAME_METHODS)
         check_choice("optimizer", self.optimizer, ("plain", "adam"))
         check_choice("order", self.order, ORDERS)
         check_number("learning_rate", self.learning_rate, above=0)
@@ -59,7 +70,7 @@ class Settings:
 
 
 def play(
-    costs: Sequence[Cost], start: Tensor, settings: Settings, checkpoints: Sequence[int] = ()
+    costs: Sequence[Cost], start: Tensor, settings: GameSettings, checkpoints: Sequence[int] = ()
 ) -> Iterator[tuple[int, Tensor]]:
     """Play the game of these domains.
 
@@ -72,31 +83,54 @@ def play(
         ValueError: no domain, a start that is not finite or whose cost is not, before any move.
     """
     _check_start(costs, start)
-    together = [lambda w: torch.stack([cost(w) for cost in costs]).mean(0)]
-    objectives = {
-        "pooled": together,
-        "ensemble": together * len(costs),
-        "ipo": costs,
-        "separate": costs,
-    }[settings.method]
-    weights = new_players(start.shape[0], len(objectives), start.shape[-1:], dtype=start.dtype)
-    weights += start if start.dim() == 3 else start.unsqueeze(1)
-    move = _mover(weights, objectives, settings)
+    if settings.method == "separate":
+        yield from _play_separately(costs, start, settings, checkpoints)
+        return
+    owned = domains_of_players(settings.method, len(costs))
+    starts = start if start.dim() == 3 else start.unsqueeze(1).expand(-1, len(owned), -1)
+    if starts.shape[1] != len(owned):
+        raise ValueError(f"start: is of {starts.shape[1]} players, must be of {len(owned)}")
+    players = LinearPlayers(
+        starts,
+        lambda weights: make_optimizer(settings.optimizer, weights, settings.learning_rate),
+        settings.bound,
+        settings.max_gradient_norm,
+        settings.order,
+    )
+    objectives = [_mean_of([costs[d] for d in domains]) for domains in owned]
     wanted = {*checkpoints, settings.num_rounds}
     for number in range(settings.num_rounds + 1):
         if number in wanted:
-            yield number, weights.clone()
+            yield number, players.weights
         if number < settings.num_rounds:
-            move()
+            players.round(objectives)
 
 
-def last(costs: Sequence[Cost], start: Tensor, settings: Settings) -> Tensor:
+def _play_separately(
+    costs: Sequence[Cost], start: Tensor, settings: GameSettings, checkpoints: Sequence[int]
+) -> Iterator[tuple[int, Tensor]]:
+    """Everybody is the only player of a game of its own, which all play side by side."""
+    alone = replace(settings, method="pooled")
+    starts = start.unbind(1) if start.dim() == 3 else [start] * len(costs)
+    games = [play([cost], own, alone, checkpoints) for cost, own in zip(costs, starts, strict=True)]
+    for reports in zip(*games, strict=True):
+        yield reports[0][0], torch.cat([players for _, players in reports], dim=1)
+
+
+def _mean_of(costs: Sequence[Cost]) -> Cost:
+    """The cost of a player that owns these domains."""
+    if len(costs) == 1:
+        return costs[0]
+    return lambda w: torch.stack([cost(w) for cost in costs]).mean(0)
+
+
+def last(costs: Sequence[Cost], start: Tensor, settings: GameSettings) -> Tensor:
     """The players ``[R, E, P]`` at the end of :func:`play`."""
     *_, (_, players) = play(costs, start, settings)
     return players
 
 
-def wishes(costs: Sequence[Cost], policy: Tensor) -> Tensor:
+def downhill(costs: Sequence[Cost], policy: Tensor) -> Tensor:
     """The downhill direction ``- grad J_d [R, E, P]`` of each domain at a policy ``[R, P]``."""
     leaf = policy.detach().requires_grad_()
     gradients = [torch.autograd.grad(cost(leaf).sum(), leaf)[0] for cost in costs]
@@ -112,11 +146,11 @@ def residual(costs: Sequence[Cost], players: Tensor, bound: float | None = None)
     costs that is exactly at a Nash equilibrium.
     """
     limit = torch.inf if bound is None else bound
-    steps = wishes(costs, average(players)) / players.shape[1]
+    steps = downhill(costs, average(players)) / players.shape[1]
     return ((players + steps).clamp(-limit, limit) - players).abs().flatten(1).amax(1)
 
 
-def gap(costs: Sequence[Cost], players: Tensor, alone: Settings) -> Tensor:
+def gap(costs: Sequence[Cost], players: Tensor, alone: GameSettings) -> Tensor:
     """The Nash gap ``[R]``: every player goes down alone as ``alone`` says, bounds included.
 
     It is a lower bound that is tight if ``alone`` has enough rounds to settle.
@@ -152,30 +186,38 @@ def vote(optima: Tensor, bound: float) -> Tensor:
     return torch.cat([optima, phantoms], dim=-2).median(dim=-2).values
 
 
-def _mover(weights: Tensor, objectives: Sequence[Cost], settings: Settings) -> Callable[[], None]:
-    """A function that lets every player make one step."""
-    limit = torch.inf if settings.bound is None else settings.bound
-    players = split_players(weights)
-    policy = average(weights)
-    optimizers = [
-        make_optimizer(settings.optimizer, [player], settings.learning_rate) for player in players
-    ]
+def correlated_noise(spurious: Tensor, causal: float = 1.0) -> Regression:
+    """``x_2 = rho_d e + sqrt(1 - rho_d^2) n``: related to the noise of y, uncorrelated with x_1.
 
-    def respond(d: int, policy_of_d: Callable[[], Tensor]) -> None:
-        seen = (lambda: players[d]) if settings.method == "separate" else policy_of_d
-        descend(optimizers[d], lambda: objectives[d](seen()), settings.max_gradient_norm)
-        players[d].detach().clamp_(-limit, limit)
+    Features have variance 1, so costs are separable and a domain's own optimum is
+    ``(c, rho_d)``. ``spurious [R, E]`` holds the rho_d.
 
-    def all_at_once() -> None:
-        share = 1 / len(players)
-        others = [policy - share * player.detach() for player in players]
-        for d, player in enumerate(players):
-            respond(d, lambda d=d, player=player: others[d] + share * player)
-        policy.copy_(average(weights))
+    Raises:
+        ValueError: fewer than two domains, a coefficient that is NaN or outside [-1, 1].
+    """
+    _check_spurious(spurious)
+    if bool((spurious.abs() > 1).any()):
+        raise ValueError(f"spurious: holds {spurious.abs().max():.3g}, must be within [-1, 1]")
+    gram = torch.eye(2, dtype=spurious.dtype).expand(*spurious.shape, 2, 2)
+    moment = torch.stack([torch.full_like(spurious, causal), spurious], dim=-1)
+    return Regression(gram, moment, torch.full_like(spurious, causal**2 + 1))
 
-    if settings.order == "together":
-        return all_at_once
-    return lambda: best_response_round(players, policy, respond)
+
+def effect_of_target(spurious: Tensor, causal: float = 1.0) -> Regression:
+    """``x_2 = beta_d y + n``: an effect of y, and so correlated with x_1, too.
+
+    ``spurious [R, E]`` holds the beta_d. Costs are not separable.
+
+    Raises:
+        ValueError: fewer than two domains, a coefficient that is not finite.
+    """
+    _check_spurious(spurious)
+    power = causal**2 + 1
+    ones = torch.ones_like(spurious)
+    rows = [ones, causal * spurious, causal * spurious, power * spurious**2 + 1]
+    gram = torch.stack(rows, dim=-1).unflatten(-1, (2, 2))
+    moment = torch.stack([causal * ones, power * spurious], dim=-1)
+    return Regression(gram, moment, power * ones)
 
 
 def _check_start(costs: Sequence[Cost], start: Tensor) -> None:
@@ -187,3 +229,13 @@ def _check_start(costs: Sequence[Cost], start: Tensor) -> None:
     for d, cost in enumerate(costs):
         if not bool(torch.isfinite(cost(policy)).all()):
             raise ValueError(f"start: costs infinitely much in domain {d}, must be finite")
+
+
+def _check_spurious(spurious: Tensor) -> None:
+    if spurious.dim() != 2 or spurious.shape[1] < 2:
+        raise ValueError(
+            f"spurious: has shape {tuple(spurious.shape)}, must be [problems, domains] "
+            "with at least 2 domains"
+        )
+    if not bool(torch.isfinite(spurious).all()):
+        raise ValueError("spurious: holds NaN or infinite coefficients, must be finite")

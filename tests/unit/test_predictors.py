@@ -22,13 +22,13 @@ from experiments.causality import (
     population,
     run_cell,
 )
+from ipo.causality.icp import icp
 from ipo.causality.predictors import (
-    METHODS,
+    PREDICTOR_METHODS,
     Classification,
+    PredictorSettings,
     Regression,
-    Settings,
     erm,
-    icp,
     irm_game_fixed_phi,
     irm_game_variable_phi,
     irm_penalties,
@@ -37,7 +37,7 @@ from ipo.causality.predictors import (
 )
 from ipo.causality.scm import moments, population_regression
 
-FAST = Settings(learning_rate=0.05, num_iterations=500)
+FAST = PredictorSettings(learning_rate=0.05, num_iterations=500)
 
 
 def random_samples(seed: int, num_runs: int = 2, num_domains: int = 3, n: int = 40, d: int = 3):
@@ -116,7 +116,7 @@ def test_without_a_penalty_it_is_erm(method):
 @pytest.mark.parametrize("method", [irmv1, vrex])
 def test_penalties_find_the_cause_where_domains_differ_much(method):
     task = population_task([-0.8, 0.5, 1.5, 2.8], [0.3, 0.7, 1.5, 3.5])
-    settings = Settings(penalty=100.0, learning_rate=0.02, num_iterations=20_000)
+    settings = PredictorSettings(penalty=100.0, learning_rate=0.02, num_iterations=20_000)
     v = method(task, settings)
     assert v[0].tolist() == pytest.approx([1.0, 0.0], abs=0.06)
     assert erm(task, settings)[0, 1].abs() > 0.05
@@ -131,7 +131,7 @@ def test_the_cause_has_no_penalty_and_equal_risks():
 def test_game_of_two_opposed_domains_drops_the_effect():
     """Bounded players whose wishes for the effect's weight differ in sign end at zero."""
     task = population_task([1.0, -1.0])
-    settings = Settings(learning_rate=0.01, num_iterations=3000, bound=2.0)
+    settings = PredictorSettings(learning_rate=0.01, num_iterations=3000, bound=2.0)
     v = irm_game_fixed_phi(task, settings)
     assert v[0].tolist() == pytest.approx([1.0, 0.0], abs=0.02)
 
@@ -143,7 +143,7 @@ def test_game_needs_two_domains():
             method(task, FAST)
 
 
-@pytest.mark.parametrize("method", METHODS.values(), ids=METHODS.keys())
+@pytest.mark.parametrize("method", PREDICTOR_METHODS.values(), ids=PREDICTOR_METHODS.keys())
 def test_runs_do_not_influence_each_other(method):
     x, y = random_samples(9, num_runs=3)
     settings = replace(FAST, num_iterations=50, penalty=10.0, num_features=3)
@@ -290,12 +290,15 @@ X, Y = torch.randn(1, 5, 2).double(), torch.zeros(1, 5).double()
             lambda: icp([torch.ones(5, 1).double()] * 2, [Y[0]] * 2),
             "feature 0 = 1.0: must not be constant",
         ),
-        (lambda: Settings(penalty=-1.0), "penalty = -1.0: must be at least 0"),
-        (lambda: Settings(ridge=-0.1), "ridge = -0.1: must be at least 0"),
-        (lambda: Settings(num_features=0), "num_features = 0: must be at least 1"),
-        (lambda: Settings(learning_rate=0.0), "learning_rate = 0.0: must be greater than 0"),
-        (lambda: Settings(bound=0.0), "bound = 0.0: must be greater than 0"),
-        (lambda: Settings(penalty=math.nan), "penalty = nan: must not be NaN"),
+        (lambda: PredictorSettings(penalty=-1.0), "penalty = -1.0: must be at least 0"),
+        (lambda: PredictorSettings(ridge=-0.1), "ridge = -0.1: must be at least 0"),
+        (lambda: PredictorSettings(num_features=0), "num_features = 0: must be at least 1"),
+        (
+            lambda: PredictorSettings(learning_rate=0.0),
+            "learning_rate = 0.0: must be greater than 0",
+        ),
+        (lambda: PredictorSettings(bound=0.0), "bound = 0.0: must be greater than 0"),
+        (lambda: PredictorSettings(penalty=math.nan), "penalty = nan: must not be NaN"),
         (lambda: Cell("ermm", "FOU", FAST), "method = 'ermm'.*did you mean 'erm'"),
         (lambda: Cell("erm", "FOX", FAST), "problem = 'FOX'.*must be one of"),
         (lambda: Cell("erm", "FOU", None), "settings = None: must be given"),

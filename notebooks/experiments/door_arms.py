@@ -1,0 +1,95 @@
+"""The four arms of the chapter on doors, from two trainings, and which rows are theirs.
+
+An arm is a cell of :mod:`experiments.door`; its rows are those with the cell's columns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from experiments import door_training
+from experiments.door import Cell
+from experiments.store import select
+from experiments.tables import mean_and_std
+from ipo.stats import bootstrap_interval
+
+NAMES = {
+    "ppo_half": "PPO, half",
+    "ppo": "PPO, as published",
+    "ipo_half": "IPO, as published",
+    "ipo": "IPO, as in the text",
+}
+PUBLISHED = ("ppo", "ipo_half")  # with the steps of the published runs
+
+
+def trainings(num_updates: int, num_steps: int) -> dict[str, door_training.Cell]:
+    """PPO and IPO as published, saved at half time and in the end; minibatches keep their size."""
+    changes = {
+        "num_updates": num_updates,
+        "num_steps": num_steps,
+        "num_minibatches": max(1, 256 * num_steps // 4096),
+    }
+    return {
+        method: door_training.Cell(
+            method,
+            door_training.published_door(method, **changes),
+            saved_after=(num_updates // 2, num_updates),
+            curve_every=max(num_updates // 19, 1),
+        )
+        for method in ("ppo", "ipo")
+    }
+
+
+def arms_of(trained: Mapping[str, door_training.Cell], **options: Any) -> dict[str, Cell]:
+    """Both trainings at half time and in the end; ``options`` of :class:`Cell`."""
+    return {
+        arm: Cell(trained[method], trained[method].saved_after[age], **options)
+        for arm, method, age in (
+            ("ppo_half", "ppo", 0),
+            ("ppo", "ppo", 1),
+            ("ipo_half", "ipo", 0),
+            ("ipo", "ipo", 1),
+        )
+    }
+
+
+def of_arm(rows: pd.DataFrame, cell: Cell, friction: float | None = None) -> pd.DataFrame:
+    """Rows of an arm's policies, in one domain or in all."""
+    chosen = select(rows, cell.columns)
+    return chosen if friction is None else chosen[chosen["domain"] == str(friction)]
+
+
+def cell_of(row: pd.Series, arms: Mapping[str, Cell]) -> Cell:
+    """The arm that a row belongs to."""
+    return next(cell for cell in arms.values() if dict(row[list(cell.columns)]) == cell.columns)
+
+
+def rate(rows: pd.DataFrame, cell: Cell, friction: float) -> pd.Series:
+    """Part of the doors opened, by run."""
+    return of_arm(rows, cell, friction).groupby("run")["value"].mean()
+
+
+def mean_rate(rows: pd.DataFrame, cell: Cell, frictions: Sequence[float]) -> pd.Series:
+    """Part of the doors opened, mean over frictions, by run."""
+    return sum(rate(rows, cell, friction) for friction in frictions) / len(frictions)
+
+
+def rate_by_friction(rows: pd.DataFrame) -> pd.Series:
+    """Part of the doors opened by all runs together."""
+    found = rows[rows["metric"] == "success"].groupby("domain")["value"].mean()
+    found.index = found.index.astype(float)
+    return found.sort_index()
+
+
+def percent(values: pd.Series) -> str:
+    return mean_and_std(100 * values)
+
+
+def percent_with_interval(values: pd.Series) -> str:
+    """Mean over runs with its 95 % bootstrap interval."""
+    low, high = bootstrap_interval(100 * values.to_numpy(), np.random.default_rng(0))
+    return f"{100 * values.mean():.1f} [{low:.0f}, {high:.0f}]"

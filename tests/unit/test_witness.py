@@ -1,0 +1,126 @@
+"""What verify and confirm say: on a toy with slices of its own, and of the shipped record."""
+
+from dataclasses import replace
+
+import pandas as pd
+import pytest
+import toy_experiment
+from toy_experiment import CELLS, Cell
+
+from experiments import confirm, registry, witness
+from experiments.experiment import Experiment
+from experiments.store import Store
+
+SHIFT = {"cost": 0.0}
+
+
+def run(cell: Cell, seeds: list[int]) -> pd.DataFrame:
+    """The toy, or the toy after a change of its code."""
+    rows = toy_experiment.run(cell, seeds)
+    return rows.assign(value=rows["value"] + SHIFT["cost"])
+
+
+def short(cell: Cell) -> Cell | None:
+    return replace(cell, power=0.25) if cell.method == "fast" else None
+
+
+@pytest.fixture
+def toy(tmp_path, monkeypatch):
+    """A chapter with results and recorded slices."""
+    experiments = {"toy": Experiment(run, Cell, short)}
+    for module in (registry, witness, confirm):
+        monkeypatch.setattr(module, "DATA", tmp_path)
+    for module in (registry, witness):
+        monkeypatch.setattr(module, "CHAPTERS", {"lqr": experiments})
+    monkeypatch.setattr(witness, "WITNESS", tmp_path / "witness")
+    monkeypatch.setattr(confirm, "CONFIRMED", tmp_path / "confirmed.json")
+    monkeypatch.setitem(SHIFT, "cost", 0.0)
+    Store(tmp_path / "results" / "lqr", "toy").fill(experiments["toy"], CELLS, [0, 1, 2], 1)
+    witness.record(num_workers=1)
+    return tmp_path
+
+
+def test_slices_are_recorded_for_what_has_one(toy):
+    batches = Store(toy / "witness" / "lqr", "toy").batches()
+    assert [batch["cell"] for batch in batches] == [
+        {"method": "fast", "size": size, "power": 0.25} for size in (10, 2)
+    ]
+
+
+def test_the_same_code_gives_what_was_recorded(toy):
+    assert witness.verify(num_workers=1) == []
+
+
+@pytest.mark.parametrize(("shift", "count"), [(1e-6, 0), (1e-3, 8)])
+def test_a_change_is_named_with_cell_metric_and_values(toy, monkeypatch, shift, count):
+    monkeypatch.setitem(SHIFT, "cost", shift)
+    problems = witness.verify(num_workers=1)
+    assert len(problems) == count
+    if count:
+        line = "lqr/toy, {'method': 'fast', 'size': 10}: run 0, domain train, metric cost: "
+        assert any(problem.startswith(line) for problem in problems)
+        assert all("recorded" in problem and "now" in problem for problem in problems)
+
+
+def test_code_that_fails_is_named_and_the_others_go_on(toy, monkeypatch):
+    monkeypatch.setitem(SHIFT, "cost", "a word")
+    problems = witness.verify(num_workers=1)
+    assert len(problems) == 2 and all("Error: " in problem for problem in problems)
+
+
+def test_a_cell_without_its_slice_is_named(toy):
+    for path in (toy / "witness" / "lqr").glob("toy.*"):
+        path.unlink()
+    assert len([p for p in witness.verify(num_workers=1) if "no slice is recorded" in p]) == 2
+
+
+def test_other_rows_are_a_difference(toy, monkeypatch):
+    whole = toy_experiment.run
+    monkeypatch.setattr(toy_experiment, "run", lambda cell, seeds: whole(cell, seeds).iloc[1:])
+    assert [" has other rows" in problem for problem in witness.verify(num_workers=1)] == [True] * 2
+
+
+@pytest.mark.parametrize(("shift", "how"), [(0.0, "exact"), (1e-4, "close"), (1.0, "differs")])
+def test_full_batches_are_confirmed_once(toy, monkeypatch, shift, how):
+    monkeypatch.setattr(confirm.origin, "commit", lambda: "0123456789")
+    monkeypatch.setattr(confirm.origin, "is_since", lambda first, later: first == later)
+    monkeypatch.setitem(SHIFT, "cost", shift)
+    outcomes = [confirm._outcome(part, toy) for part in confirm.full_batches(["lqr"])]
+    assert [outcome["how"] for _, outcome in outcomes] == [how] * 3
+    for cell, outcome in outcomes:
+        confirm._save(cell, outcome)
+    titles = map(confirm.title, confirm.full_batches(["lqr"]))
+    left = [cell for cell in titles if not confirm._is_done(confirm.confirmed(), cell, None)]
+    assert len(left) == (3 if how == "differs" else 0)
+
+
+def curves(runs: range, shift: float = 0.0) -> pd.DataFrame:
+    """Learning curves of some runs, which differ by their number."""
+    return pd.DataFrame(
+        {"method": "a", "frames": f, "run": r, "domain": "d", "metric": "m", "value": f + r + shift}
+        for r in runs
+        for f in range(10)
+    )
+
+
+@pytest.mark.parametrize(
+    ("shift", "num_runs", "expected"),
+    [(0.3, 1, True), (30.0, 1, False), (0.3, 15, True), (30.0, 15, False)],
+)
+def test_chaotic_runs_are_alike_or_not(shift, num_runs, expected):
+    shipped = curves(range(20))
+    again = curves(range(5, 5 + num_runs), shift)
+    both = witness.side_by_side(shipped[shipped["run"].isin(again["run"])], again)
+    assert confirm.alike(shipped, {"method": "a"}, both) == expected
+
+
+def test_an_experiment_that_is_not_there_is_named():
+    with pytest.raises(ValueError, match=r"experiment = 'lqr/table': .*mean 'lqr/tables'"):
+        registry.chosen(["lqr/table"])
+
+
+def test_every_cell_that_has_a_slice_has_it_recorded():
+    for chapter, name in registry.chosen([]):
+        recorded = [b["columns"] for b in Store(witness.WITNESS / chapter, name).batches()]
+        wanted = [cell.columns for cell in witness.short_cells(chapter, name)]
+        assert sorted(map(str, wanted)) == sorted(map(str, recorded)), f"{chapter}/{name}"
