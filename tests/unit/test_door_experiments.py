@@ -22,7 +22,7 @@ from experiments.door_training import (
     published_door,
 )
 from experiments.policies import save_policy
-from ipo.dense_network import DenseNetwork
+from ipo.networks import DenseNetwork
 from ipo.worlds.door import DoorEnv
 from ipo.worlds.many_doors import VectorDoor
 
