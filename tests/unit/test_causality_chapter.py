@@ -179,7 +179,7 @@ def test_regression_on_the_causes_does_not_change_and_on_an_effect_it_does():
 def test_erm_in_closed_form_is_what_the_shipped_training_arrived_at():
     runs = [causality.chain_run("FOS", seed) for seed in (0, 1)]
     task = Regression.from_samples(*causality.stack([domains for domains, _, _ in runs]))
-    v = torch.linalg.solve(task.A.mean(1), task.b.mean(1))
+    v = torch.linalg.solve(task.gram.mean(1), task.moment.mean(1))
     rows = Store(ROOT / "data" / "results" / "causality", "linear").rows()
     shipped = rows[(rows["problem"] == "FOS") & (rows["method"] == "erm")]
     for (_, metric), values in causality.chain_metrics(runs, v).items():
