@@ -160,10 +160,11 @@ class DenseNetwork(Network):
 
         def policy(observations: Tensor) -> Outputs:
             x = observations.numpy()
-            parameters = np.sum([outputs(own, "actor", x) for own in weights], 0) / len(weights)
-            values = np.sum([outputs(own, "critic", x) for own in weights], 0)[..., 0] / len(
-                weights
+            parameters, values = (
+                np.sum([outputs(own, part, x) for own in weights], 0) / len(weights)
+                for part in ("actor", "critic")
             )
+            values = values[..., 0]
             if deviation is not None:
                 spread = np.broadcast_to(deviation, parameters.shape)
                 parameters = np.concatenate([parameters, spread], -1)
