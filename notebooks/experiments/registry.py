@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from experiments import algorithm, causality, door, keys, lqr, own_domains
+from experiments import causality, keys, lqr, own_domains
+from experiments.doors import success as door
 from experiments.experiment import Experiment, Places
+from experiments.games import scalar as algorithm
 from experiments.origin import ROOT
 from ipo.checks import check_choice
 

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from experiments.door_training import NETWORK, new_training, published_door
+from experiments.doors.training import NETWORK, new_training, published_door
 from experiments.files import replace_text
 from ipo.worlds.door import DoorEnv
 from ipo.worlds.many_doors import VectorDoor

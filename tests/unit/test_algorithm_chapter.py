@@ -6,9 +6,10 @@ import pytest
 import torch
 from small import assert_close, assert_near
 
-from experiments import algorithm, games_played
-from experiments.algorithm import Cell, problem_cell
-from experiments.games_played import Game, Gap, Steps, Trajectory, Vote
+from experiments.games import played as games_played
+from experiments.games import scalar as algorithm
+from experiments.games.played import Game, Gap, Steps, Trajectory, Vote
+from experiments.games.scalar import Cell, problem_cell
 from ipo.causality.scalar_control import stationary_cost
 from ipo.causality.small_games import GameSettings, effect_of_target, play, vote
 

@@ -10,8 +10,8 @@ import pytest
 import torch
 from torch import nn
 
-from experiments.authors_policies import FOLDER, authors_policies, load_authors_policy
-from experiments.door_training import NETWORK
+from experiments.doors.authors_policies import FOLDER, authors_policies, load_authors_policy
+from experiments.doors.training import NETWORK
 
 
 def layers(*sizes):

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import torch
 
-from experiments import door_training
 from experiments.checkpoints import (
     CheckpointError,
     CheckpointWarning,
@@ -19,7 +18,8 @@ from experiments.checkpoints import (
     previous,
     save_checkpoint,
 )
-from experiments.door_training import NETWORK, Cell, Run, published_door, train_run
+from experiments.doors import training as door_training
+from experiments.doors.training import NETWORK, Cell, Run, published_door, train_run
 from experiments.policies import load_policy
 
 TREE = {
@@ -169,7 +169,7 @@ def test_kill_loses_one_update_at_most(tmp_path):
     script = tmp_path / "train.py"
     script.write_text(
         "import torch\n"
-        "from experiments.door_training import Cell, published_door, train_run\n"
+        "from experiments.doors.training import Cell, published_door, train_run\n"
         "torch.set_num_threads(1)\n"
         "settings = published_door('ppo', num_updates=50, num_envs=(1, 1), num_steps=512,\n"
         "                          num_minibatches=2, num_epochs=1)\n"

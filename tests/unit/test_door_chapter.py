@@ -7,10 +7,14 @@ import pandas as pd
 import pytest
 import scipy.stats
 
-from experiments import door_figures, door_tables, door_training, door_ways, pictures
-from experiments.door import door_seeds, evaluation_doors
-from experiments.door_arms import arms_of, cell_of, mean_rate, rate, rate_by_friction, trainings
-from experiments.door_training import NETWORK, policy_path
+from experiments import pictures
+from experiments.doors import figures as door_figures
+from experiments.doors import tables as door_tables
+from experiments.doors import training as door_training
+from experiments.doors import ways as door_ways
+from experiments.doors.arms import arms_of, cell_of, mean_rate, rate, rate_by_friction, trainings
+from experiments.doors.success import door_seeds, evaluation_doors
+from experiments.doors.training import NETWORK, policy_path
 from experiments.policies import save_policy
 from ipo.worlds.door import DoorEnv
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from experiments import door_training
-from experiments.door import (
+from experiments.doors import training as door_training
+from experiments.doors.success import (
     EVALUATION_SEED,
     Cell,
     door_seeds,
@@ -13,7 +13,7 @@ from experiments.door import (
     evaluation_doors,
     load_players,
 )
-from experiments.door_training import (
+from experiments.doors.training import (
     CELLS,
     NETWORK,
     last_info,

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from experiments import door as door_experiments
-from experiments.door import Cell, ScriptedCell, watch
-from experiments.door_training import CELLS, NETWORK, last_info, policy_path
+from experiments.doors import success as door_experiments
+from experiments.doors.success import Cell, ScriptedCell, watch
+from experiments.doors.training import CELLS, NETWORK, last_info, policy_path
 from experiments.policies import save_policy
 from ipo.worlds.door import DoorEnv, DoorParams
 from ipo.worlds.hooking import Hooking

@@ -5,7 +5,7 @@ import pytest
 import torch
 from small import assert_close, assert_near
 
-from experiments.algorithm import START, Cell, gains_of, problems, run_cell, standard
+from experiments.games.scalar import START, Cell, gains_of, problems, run_cell, standard
 from ipo.causality.scalar_control import (
     EDGE,
     costs,

@@ -11,9 +11,10 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from experiments import games_played, players
 from experiments.experiment import Experiment
 from experiments.figures import OUTCOMES
+from experiments.games import played as games_played
+from experiments.games import players
 from experiments.origin import ROOT
 from experiments.rows import tidy
 from experiments.store import Store, select

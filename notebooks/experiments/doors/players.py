@@ -10,8 +10,8 @@ from typing import Any
 import pandas as pd
 from tqdm import tqdm
 
-from experiments import door_training
-from experiments.door_training import (
+from experiments.doors import training as door_training
+from experiments.doors.training import (
     EVALUATION_SEED,
     TRAIN_FRICTIONS,
     last_info,

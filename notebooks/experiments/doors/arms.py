@@ -1,6 +1,6 @@
 """The four arms of the chapter on doors, from two trainings, and which rows are theirs.
 
-An arm is a cell of :mod:`experiments.door`; its rows are those with the cell's columns.
+An arm is a cell of :mod:`experiments.doors.success`; its rows are those with the cell's columns.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from experiments import door_training
-from experiments.door import Cell
+from experiments.doors import training as door_training
+from experiments.doors.success import Cell
 from experiments.store import select
 from experiments.tables import mean_and_std
 from ipo.stats import bootstrap_interval

@@ -16,7 +16,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from experiments.door_training import NETWORK
+from experiments.doors.training import NETWORK
 from ipo.networks import Weights
 
 FOLDER = Path("DoorGym", "pretrained_models")

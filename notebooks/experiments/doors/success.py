@@ -15,8 +15,9 @@ import numpy as np
 import pandas as pd
 import torch
 
-from experiments import door_players, door_training
-from experiments.door_training import (
+from experiments.doors import players as door_players
+from experiments.doors import training as door_training
+from experiments.doors.training import (
     CHOICES,
     EVALUATION_SEED,
     NETWORK,

@@ -15,9 +15,7 @@ import numpy as np
 import pandas as pd
 import scipy.stats
 
-from experiments.authors_policies import authors_policies
-from experiments.door import Cell
-from experiments.door_arms import (
+from experiments.doors.arms import (
     NAMES,
     PUBLISHED,
     mean_rate,
@@ -25,7 +23,9 @@ from experiments.door_arms import (
     percent_with_interval,
     rate,
 )
-from experiments.door_training import CURVE_FRICTION, EVALUATION_SEED, TRAIN_FRICTIONS, last_info
+from experiments.doors.authors_policies import authors_policies
+from experiments.doors.success import Cell
+from experiments.doors.training import CURVE_FRICTION, EVALUATION_SEED, TRAIN_FRICTIONS, last_info
 from ipo.stats import paired_difference, probability_of_improvement
 
 PAIRS = {

@@ -1,6 +1,6 @@
 """Train policies for doors, each run where it was interrupted.
 
-    python -m experiments.train_door [--cells ppo ipo] [--seeds 0 1 2]
+    python -m experiments.doors.train [--cells ppo ipo] [--seeds 0 1 2]
 
 Runs are trained one after the other, seed by seed; those that are finished are left alone. A run
 that ends adds its policies and its learning curve to ``data/``; one that is interrupted loses at
@@ -15,7 +15,7 @@ from pathlib import Path
 import torch
 from tqdm import tqdm
 
-from experiments.door_training import CELLS, EXPERIMENT
+from experiments.doors.training import CELLS, EXPERIMENT
 from experiments.experiment import Places
 from experiments.store import Store
 

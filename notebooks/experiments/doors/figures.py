@@ -12,7 +12,8 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from experiments import figures, pictures
-from experiments.door import (
+from experiments.doors.arms import NAMES, PUBLISHED, cell_of, rate
+from experiments.doors.success import (
     TEST_FRICTIONS,
     Cell,
     door_seeds,
@@ -20,9 +21,8 @@ from experiments.door import (
     most_likely,
     scripted,
 )
-from experiments.door_arms import NAMES, PUBLISHED, cell_of, rate
-from experiments.door_training import CURVE_FRICTION, TRAIN_FRICTIONS
-from experiments.door_ways import STRATEGIES, TRAITS, success_by_lever, trait_correlations
+from experiments.doors.training import CURVE_FRICTION, TRAIN_FRICTIONS
+from experiments.doors.ways import STRATEGIES, TRAITS, success_by_lever, trait_correlations
 from ipo.worlds.door import GEAR, DoorEnv
 
 
@@ -98,7 +98,7 @@ def strategy_sheet(
 ) -> Figure:
     """Film strips of how doors are opened: the last steps until the door is open.
 
-    An example is a row of :func:`experiments.door_ways.opened_parts`.
+    An example is a row of :func:`experiments.doors.ways.opened_parts`.
     """
     num_rows = max(len(examples), 1)
     fig, axes = plt.subplots(num_rows, num_frames, figsize=(9, 1.15 * num_rows), squeeze=False)
@@ -263,8 +263,8 @@ def robustness(
     """Success against the way of opening, over policies and door by door.
 
     Args:
-        policies: :func:`experiments.door_ways.parts_and_success`, at ``hard`` and ``hardest``.
-        doors: :func:`experiments.door_ways.same_doors`, at ``easy`` and ``hard``.
+        policies: :func:`experiments.doors.ways.parts_and_success`, at ``hard`` and ``hardest``.
+        doors: :func:`experiments.doors.ways.same_doors`, at ``easy`` and ``hard``.
     """
     fig, (left, right) = plt.subplots(1, 2, figsize=(9.5, 3.7))
     for arm, cell in arms.items():

@@ -1,0 +1,1 @@
+"""The games of the chapter on the algorithm: two numbers, scalar control, players of the keys."""
