@@ -57,7 +57,7 @@ class Chapter:
         return Store(self.folder, name).fill(experiment, cells, list(seeds), self.workers)
 
     def slices(self, name: str, **columns: Any) -> tuple[pd.DataFrame, pd.DataFrame]:
-        """Recorded short slices of the cells with these columns, and what they give now.
+        """What the short slices of the cells with these columns give now, and all recorded ones.
 
         Such slices of all cells are what ``make verify`` computes again.
         """
@@ -66,7 +66,7 @@ class Chapter:
         batches = [b for b in store.batches() if columns.items() <= b["columns"].items()]
         cells = [rebuilt(experiment.cell, batch["cell"]) for batch in batches]
         now = [timed(experiment.run, c, b["seeds"])[1] for c, b in zip(cells, batches, strict=True)]
-        return store.rows(), pd.concat(now, ignore_index=True)
+        return pd.concat(now, ignore_index=True), store.rows()
 
     def paper(self) -> pd.DataFrame:
         """The paper's numbers."""

@@ -403,26 +403,17 @@ def table_by(
     return table.rename(index=names).rename_axis("arm").reset_index()
 
 
-def beside(shipped: pd.DataFrame, rows: pd.DataFrame) -> pd.DataFrame:
-    """Rows computed again, with the shipped values of the same runs and the ``difference``."""
-    same = [column for column in rows.columns if column != "value"]
-    both = rows.merge(shipped, on=same, suffixes=("", "_shipped"), validate="1:1")
-    if len(both) < len(rows):
-        raise ValueError(f"{len(rows) - len(both)} of {len(rows)} rows are not among the shipped")
-    return both.assign(difference=(both["value"] - both["value_shipped"]).abs())
-
-
 def by_update(both: pd.DataFrame) -> pd.DataFrame:
-    """What :func:`beside` found on learning curves of :data:`MAIN`: by arm and number of frames.
+    """Live rows beside shipped ones, of learning curves of :data:`MAIN`: by arm and number of frames.
 
     Means over runs, shipped and live, and the largest difference of any run.
     """
     columns = {}
     groups = both.groupby(["domain", "method", "frames"], sort=False)
-    means = groups[["value_shipped", "value"]].mean()
+    means = groups[["shipped", "live"]].mean()
     for color in both["domain"].unique():
-        columns[f"{color}, shipped"] = means.loc[color]["value_shipped"]
-        columns[f"{color}, live"] = means.loc[color]["value"]
+        columns[f"{color}, shipped"] = means.loc[color]["shipped"]
+        columns[f"{color}, live"] = means.loc[color]["live"]
     by_arm = both.groupby(["method", "frames"], sort=False)
     columns["largest difference"] = by_arm["difference"].max()
     return pd.DataFrame(columns).rename(index=MAIN).rename_axis(["arm", "frames"]).reset_index()

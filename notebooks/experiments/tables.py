@@ -44,6 +44,8 @@ def costs(folder: str | Path, names: Sequence[str]) -> Styler:
 def beside_shipped(live: pd.DataFrame, shipped: pd.DataFrame) -> pd.DataFrame:
     """Live rows with the shipped ones of the same keys, and how far they are apart.
 
+    A ``relative difference`` is one to the shipped value, or to 0.001 where that is nearly zero.
+
     Raises:
         ValueError: a live row of which none is shipped.
     """
@@ -54,7 +56,18 @@ def beside_shipped(live: pd.DataFrame, shipped: pd.DataFrame) -> pd.DataFrame:
     if both["shipped"].isna().any():
         first = both.loc[both["shipped"].isna(), keys].iloc[0].to_dict()
         raise ValueError(f"shipped: has no row for {first}, must have one for each live row")
-    return both.assign(**{"relative difference": (both["live"] / both["shipped"] - 1).abs()})
+    difference = (both["live"] - both["shipped"]).abs()
+    relative = difference / (both["shipped"].abs() + 1e-3)
+    return both.assign(**{"difference": difference, "relative difference": relative})
+
+
+def largest_differences(
+    live: pd.DataFrame, shipped: pd.DataFrame, by: Sequence[str]
+) -> pd.DataFrame:
+    """The largest relative difference of live rows from the shipped ones, by groups."""
+    groups = beside_shipped(live, shipped).groupby(list(by), sort=False)
+    largest = groups["relative difference"].max().reset_index()
+    return largest.rename(columns={"relative difference": "largest relative difference"})
 
 
 def mean_and_interval(values: pd.Series, digits: int = 2) -> str:
@@ -74,18 +87,3 @@ def by_method(
     wide = groups.apply(mean_and_interval, digits=digits).unstack()
     present = [method for method in names if method in wide.index]
     return wide.reindex(present).rename(index=names).rename_axis("method")
-
-
-def largest_differences(
-    recorded: pd.DataFrame, now: pd.DataFrame, by: Sequence[str]
-) -> pd.DataFrame:
-    """By how much rows differ from the recorded ones: the largest relative difference, by groups.
-
-    Infinite where a row was never recorded.
-    """
-    keys = [column for column in recorded.columns if column != "value"]
-    both = now.merge(recorded, "left", keys, suffixes=("_now", ""), validate="one_to_one")
-    difference = (both["value_now"] - both["value"]).abs() / (both["value"].abs() + 1e-3)
-    both = both.assign(difference=difference.fillna(np.inf))
-    largest = both.groupby(list(by), sort=False)["difference"].max().reset_index()
-    return largest.rename(columns={"difference": "largest relative difference"})

@@ -29,6 +29,7 @@ from experiments.keys import (
 )
 from experiments.policies import load_policy
 from experiments.store import Batch, Store
+from experiments.tables import beside_shipped
 from ipo.networks import GridNetwork
 from ipo.worlds.colored_keys import COLORS
 from ipo.worlds.tabular import TabularTask, expected_return, occupancy
@@ -549,15 +550,15 @@ def test_runs_needed_have_the_stated_power():
 def test_computed_rows_stand_beside_the_shipped_ones_of_the_same_run():
     shipped = made_up({("ppo", "red"): [0.1, 0.2], ("ppo", "grey"): [0.3, 0.4]}).assign(frames=64)
     again = shipped[shipped["domain"] == "red"].assign(value=[0.25, 0.1]).iloc[::-1]
-    both = experiment.beside(shipped, again)
-    assert both["run"].tolist() == [0, 1] and both["value_shipped"].tolist() == [0.1, 0.2]
+    both = beside_shipped(again, shipped).sort_values("run")
+    assert both["run"].tolist() == [0, 1] and both["shipped"].tolist() == [0.1, 0.2]
     assert both["difference"].tolist() == pytest.approx([0, 0.05])
     (row,) = experiment.by_update(both).to_dict("records")
     assert (row.pop("arm"), row.pop("frames")) == ("PPO, as published", 64)
     means = {"red, shipped": 0.15, "red, live": 0.175, "largest difference": 0.05}
     assert row == pytest.approx(means)
-    with pytest.raises(ValueError, match="1 of 2 rows are not among the shipped"):
-        experiment.beside(shipped[shipped["run"] == 0], again)
+    with pytest.raises(ValueError, match=r"has no row for \{.*'run': 1"):
+        beside_shipped(again, shipped[shipped["run"] == 0])
 
 
 def test_encodings_keep_the_arms_of_each_network_apart(shipped):
