@@ -404,7 +404,7 @@ def table_by(
 
 
 def by_update(both: pd.DataFrame) -> pd.DataFrame:
-    """Live rows beside shipped ones, of learning curves of :data:`MAIN`: by arm and number of frames.
+    """Live rows beside shipped ones, of curves of :data:`MAIN`: by arm and number of frames.
 
     Means over runs, shipped and live, and the largest difference of any run.
     """
