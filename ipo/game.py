@@ -9,7 +9,7 @@ domains falls, while the others stand still. All methods of the book are this ga
     ensemble                                    as many players, each of which owns all domains
 
 Players are linear controllers and predictors (:class:`LinearPlayers`, here) or networks
-(:mod:`ipo.ppo`); they all play :func:`play_round`.
+(``ipo.ppo``); they all play :func:`play_round`.
 
 Source: Algorithm 1 of Sonar, Pacelli and Majumdar (2021), after Ahuja et al. (2020).
 """

@@ -37,7 +37,8 @@ class LQR:
     Attributes:
         A: dynamics ``[R, n_x, n_x]``.
         B: inputs ``[R, n_x, n_u]``.
-        Q, R: weights of state ``[R, n_x, n_x]`` and input ``[R, n_u, n_u]`` in the cost.
+        Q: weights of the state in the cost ``[R, n_x, n_x]``.
+        R: weights of the input ``[R, n_u, n_u]``.
         seen: observations of the training domains side by side, ``[W_1 ... W_E]``,
             ``[R, n_o, E n_x]``: one product ``K seen`` gives the feedback in all of them.
         W_test: observation of the test domain ``[R, n_o, n_x]``.

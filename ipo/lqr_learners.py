@@ -26,7 +26,7 @@ class LQRSettings:
     """How a method is trained. The defaults are the paper's, where it states them.
 
     Attributes:
-        method: one of :data:`LQR_METHODS`.
+        method: one of ``LQR_METHODS``.
         optimizer: ``adam`` (the published runs), ``plain`` (the paper's text) or ``lbfgs``.
         learning_rate: step size; the paper has 1e-3, and 5e-4 for IPO (Table 5).
         num_iterations: steps of the single player, or rounds of all players.

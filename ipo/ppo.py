@@ -199,7 +199,7 @@ class Training:
     def reports(self) -> Iterator[tuple[int, list[Weights]]]:
         """Train to the end: ``(num_frames, players)`` now and after each update.
 
-        The weights change in place: keep what you need with :func:`ipo.networks.copied`.
+        The weights change in place: keep what you need with ``ipo.networks.copied``.
         """
         yield self.num_frames, self.players
         for _ in range(self.settings.num_updates):
@@ -311,11 +311,11 @@ def clipped_loss(
     batch: Rollout,
     settings: PPOSettings,
 ) -> Tensor:
-    """PPO's loss ``[R]``, to be minimised, on a minibatch ``[R, B]``.
+    """PPO's loss ``[R]``, to be minimised, on a minibatch ``[R, B]``::
 
-    - mean min(rho A, clip(rho, 1 - c, 1 + c) A) - w_e mean H(pi)
-    + w_v mean max((V - G)^2, (V_old + clip(V - V_old, -c, c) - G)^2),
-    rho = pi(a | o) / pi_old(a | o),    G: the returns of the rollout
+        - mean min(rho A, clip(rho, 1 - c, 1 + c) A) - w_e mean H(pi)
+        + w_v mean max((V - G)^2, (V_old + clip(V - V_old, -c, c) - G)^2),
+        rho = pi(a | o) / pi_old(a | o),    G: the returns of the rollout
     """
     gains = batch.advantages
     if settings.normalize_advantages == "minibatch":

@@ -149,7 +149,9 @@ class Collector:
     Attributes:
         environments: all begin now.
         num_steps: T, of each rollout.
-        discount, gae_lambda, time_outs: see :class:`ipo.ppo.PPOSettings`.
+        discount: gamma.
+        gae_lambda: lambda of the advantage estimate.
+        time_outs: see :class:`ipo.ppo.PPOSettings`.
         reward_clip: bound on normalised rewards; ``None``: they are not normalised.
     """
 

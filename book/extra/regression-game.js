@@ -1,6 +1,6 @@
 // The game of two players with one spurious weight each, to be played with sliders.
 // Plain JavaScript, no library, works from a folder. Used on the page "From IRM to IPO", where a
-// static picture stands in its place without scripts. Names follow ipo/vector_game.py.
+// static picture stands in its place without scripts. Names follow ipo/causality/small_games.py.
 "use strict";
 (() => {
   const LIMIT = 3.2, SIZE = 400, ROUNDS = 6000, RATE = 0.1;

@@ -210,7 +210,7 @@ def erm(task: Task, settings: PredictorSettings) -> Tensor:
 
 
 def irmv1(task: Task, settings: PredictorSettings) -> Tensor:
-    """Invariant risk minimisation, first version, for ``v = Phi w`` with w fixed at ones.
+    """Invariant risk minimisation, first version, for ``v = Phi w`` with w fixed at ones::
 
         min_Phi  (1 / E) sum_e [ R_e(Phi 1) + penalty * |d/dw R_e(Phi w) at w = 1|^2 / k ]
 

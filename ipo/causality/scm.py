@@ -115,7 +115,7 @@ class SCM:
 
     @property
     def edges(self) -> list[tuple[str, str]]:
-        """The graph: a pair ``(cause, effect)`` for every direct cause."""
+        """Pairs ``(cause, effect)`` of all direct causes, which make the graph."""
         return [(parent, name) for name in self.assignments for parent in self.parents(name)]
 
     def descendants(self, name: str) -> set[str]:
