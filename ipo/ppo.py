@@ -315,7 +315,9 @@ def clipped_loss(
 
         - mean min(rho A, clip(rho, 1 - c, 1 + c) A) - w_e mean H(pi)
         + w_v mean max((V - G)^2, (V_old + clip(V - V_old, -c, c) - G)^2),
-        rho = pi(a | o) / pi_old(a | o),    G: the returns of the rollout
+        rho = pi(a | o) / pi_old(a | o)
+
+    G are the returns of the rollout.
     """
     gains = batch.advantages
     if settings.normalize_advantages == "minibatch":

@@ -48,8 +48,8 @@ def icp(features: Sequence[Tensor], targets: Sequence[Tensor], alpha: float = 0.
     Source: Peters, Bühlmann and Meinshausen (2016), Section 3.1.2.
 
     Raises:
-        ValueError: see :func:`check_domains`; also for a level outside (0, 1), for a single
-            domain, and for a feature that is constant in all of them.
+        ValueError: see :func:`ipo.causality.predictors.check_domains`; also for a level outside
+            (0, 1), for a single domain, and for a feature that is constant in all of them.
     """
     check_number("alpha", alpha, above=0)
     if alpha >= 1:
