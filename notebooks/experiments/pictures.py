@@ -210,7 +210,8 @@ def door_scene(params: DoorParams, width: int = 640, height: int = 480) -> mujoc
     """:func:`ipo.worlds.door.build_door` with paint, light, frame, wall and floor, for pictures."""
     spec = build_door(params)
     spec.visual.global_.offwidth, spec.visual.global_.offheight = width, height
-    spec.visual.quality.shadowsize, spec.visual.quality.offsamples = 2048, 8
+    spec.visual.quality.shadowsize, spec.visual.quality.offsamples = 1536, 8
+    spec.visual.map.shadowclip = 0.3  # shadows of what is near, so that a small map is sharp
     spec.visual.headlight.ambient, spec.visual.headlight.diffuse = [0.38] * 3, [0.25] * 3
     spec.visual.headlight.specular = [0.05] * 3
     spec.visual.map.znear, spec.visual.map.zfar = 0.01, 30
