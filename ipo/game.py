@@ -134,9 +134,8 @@ class LinearPlayers:
     def _move_in_turn(self, d: int, cost: Cost) -> None:
         """Player d steps; the average holds its new weights before the next player moves."""
         player, share = self.players[d], 1 / len(self.players)
-        self.policy.sub_(
-            player.detach(), alpha=share
-        )  # now the others' part; in place: it is large
+        # In place, because it is large: what is left is the others' part.
+        self.policy.sub_(player.detach(), alpha=share)
         self._step(d, lambda: cost(self.policy.add(player, alpha=share)))
         self.policy.add_(player.detach(), alpha=share)
 
