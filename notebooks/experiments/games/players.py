@@ -17,9 +17,10 @@ from experiments import keys
 from experiments.experiment import Experiment
 from experiments.keys import Keys, encode
 from experiments.rows import tidy
+from ipo.game import nash_gap
 from ipo.networks import OnTable, Weights, copied
 from ipo.ppo import Training
-from ipo.worlds.tabular import TabularDomains, expected_return, optimal_policy
+from ipo.worlds.tabular import TabularDomains, optimal_policy
 
 
 @dataclass(frozen=True)
@@ -50,8 +51,8 @@ def run_players(cell: Cell, seeds: list[int], tables: str | Path) -> pd.DataFram
     actions of the training domains).
 
     At the checkpoints also what each player gains in its own domain when it goes on alone while
-    the others stand still. The best of them is a lower bound on the
-    Nash gap. An upper bound is what is missing to the optimal return in the worst domain.
+    the others stand still. The best of them is a lower bound on the Nash gap. An upper bound is
+    what is missing to the optimal return in the worst domain.
     """
     trained = cell.trained
     colors = trained.train_colors
@@ -66,14 +67,12 @@ def run_players(cell: Cell, seeds: list[int], tables: str | Path) -> pd.DataFram
     for update in range(trained.settings.num_updates + 1):
         if update:
             training.update()
-        returns = _returns(task, training.players, colors)
-        metrics = {
+        returns = keys.returns(task, training.players, colors)
+        now = np.stack(list(returns.values()), 1)  # [R, E]
+        metrics = returns | {
             ("all", "distance_players"): _distance(training.players[0], training.players[-1]),
             ("all", "distance_start"): _distance(training.players[0], start[0]),
-            ("train", "gap_upper"): np.max([b - r for b, r in zip(best, returns, strict=True)], 0),
-        }
-        metrics |= {
-            (color, "return_exact"): own for color, own in zip(colors, returns, strict=True)
+            ("train", "gap_upper"): _gap(now, np.broadcast_to(best, now.shape)),
         }
         if update:
             moves = [
@@ -82,13 +81,19 @@ def run_players(cell: Cell, seeds: list[int], tables: str | Path) -> pd.DataFram
             ]
             metrics["all", "move_correlation"] = _correlation(moves[0], moves[-1])
         if update in cell.checkpoints:
-            gains = [
-                _returns(task, _alone(training, d, cell.num_alone), colors)[d] - returns[d]
-                for d in range(len(training.players))
+            better = [
+                keys.returns(task, _alone(training, d, cell.num_alone), [color])
+                for d, color in enumerate(colors)
             ]
-            metrics["train", "gap_lower"] = np.maximum(np.max(gains, 0), 0)
+            after = np.stack([own for found in better for own in found.values()], 1)
+            metrics["train", "gap_lower"] = _gap(now, after).clip(min=0)
         parts.append(tidy(cell, seeds, metrics, update=update))
     return pd.concat(parts, ignore_index=True)
+
+
+def _gap(returns: np.ndarray, better: np.ndarray) -> np.ndarray:
+    """The Nash gap ``[R]`` in returns ``[R, E]``, which are negative costs."""
+    return nash_gap(torch.tensor(-returns), torch.tensor(-better)).numpy()
 
 
 def _alone(training: Training, d: int, num_updates: int) -> list[Weights]:
@@ -117,16 +122,6 @@ def _correlation(one: Tensor, other: Tensor) -> Tensor:
     """Of all numbers of a run, ``[R]``."""
     one, other = one.flatten(1), other.flatten(1)
     return torch.cosine_similarity(one - one.mean(1, True), other - other.mean(1, True), dim=1)
-
-
-def _returns(task: Keys, players: Sequence[Weights], colors: Sequence[str]) -> list[np.ndarray]:
-    """Exact return ``[R]`` of the players' average in each colour."""
-    return [
-        expected_return(
-            task.tasks[color], task.logits(players, task.tasks[color].images).softmax(-1).numpy()
-        )[0]
-        for color in colors
-    ]
 
 
 @torch.no_grad()
