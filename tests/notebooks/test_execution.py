@@ -10,6 +10,7 @@ import yaml
 
 ROOT = Path(__file__).resolve().parents[2]
 NAMES = [path.stem for path in sorted((ROOT / "notebooks").glob("*.ipynb"))]
+QUICK = ("lqr", "your_own_domains")
 SMOKE = yaml.safe_load((ROOT / "notebooks" / "profiles" / "smoke.yml").read_text())
 
 
@@ -33,9 +34,14 @@ def test_executed_copy_holds_no_times_and_no_places(smoke_build, name):
     assert [trace for trace in traces if trace in text] == []
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    "name", [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in NAMES]
+)
 def test_runs_by_hand_as_in_jupyterlab(tmp_path, name):
-    """In the folder of the notebooks; the build runs them in that of the project."""
+    """In the folder of the notebooks; the build runs them in that of the project.
+
+    No notebook depends on the folder (see test_sources), so the quick ones stand for all.
+    """
     parameters = yaml.safe_dump(SMOKE.get(name, {}))
     done = papermill(name, tmp_path / "out.ipynb", "--cwd", "notebooks", "-y", parameters)
     assert done.returncode == 0, done.stderr

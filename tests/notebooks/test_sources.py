@@ -1,5 +1,6 @@
 """Notebooks are committed as sources: nothing in them comes from a run."""
 
+import re
 from pathlib import Path
 
 import nbformat
@@ -29,6 +30,19 @@ def test_has_no_traces_of_a_run(notebook):
 def test_has_one_parameters_cell(notebook):
     tagged = [cell for cell in notebook.cells if "parameters" in cell.metadata.get("tags", [])]
     assert [cell.cell_type for cell in tagged] == ["code"]
+
+
+def test_finds_data_from_every_folder(notebook):
+    """By the folder of the project; only parameters are relative, and ``Chapter`` knows to what."""
+    code = [cell.source for cell in notebook.cells if cell.cell_type == "code"]
+    lines = [line.strip() for source in code for line in source.splitlines() if "data/" in line]
+    wrong = [n for n in lines if "ROOT / " not in n and not re.match(r'\w+_dir = "data/', n)]
+    assert wrong == []
+
+
+def test_has_no_long_cell(notebook):
+    code = [cell.source for cell in notebook.cells if cell.cell_type == "code"]
+    assert [source for source in code if len(source.splitlines()) > 40] == []
 
 
 def test_runs_on_the_environment_of_the_book(notebook):
