@@ -11,6 +11,7 @@ from pathlib import Path
 import pandas as pd
 import yaml
 
+from experiments.paper import read_paper
 from experiments.store import Store
 from rules import IN_PART, NO_DATA, NOT_SUPPORTED, REPRODUCED, RULES, Cells, Finding, NoData
 
@@ -40,7 +41,7 @@ def load_cells(results: list[str], chapter: dict, data: Path = DATA) -> Cells:
 
 def load_paper(name: str, data: Path = DATA) -> pd.DataFrame:
     """The paper's means; what stands in two of its tables is kept once."""
-    table = pd.read_csv(data / "paper" / f"{name}.csv")
+    table = read_paper(name, data / "paper")
     return table.drop(columns="table", errors="ignore").drop_duplicates()
 
 
@@ -111,9 +112,7 @@ def headline(entry: dict, chapter: dict, cells: Cells, paper: pd.DataFrame) -> t
         ours = f"{cells.runs(**chapter['measured'], **entry['cell']).mean():.{digits}f}"
     except NoData:
         ours = "–"
-    theirs = paper
-    for column, value in entry["paper"].items():
-        theirs = theirs[theirs[column] == value]
+    theirs = Cells(paper, num_runs=1).select(**entry["paper"])
     return entry["label"], f"{theirs['mean'].item():.{digits}f}" if entry["paper"] else "–", ours
 
 

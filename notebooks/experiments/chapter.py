@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -17,6 +18,7 @@ from pandas.io.formats.style import Styler
 from experiments import figures, tables
 from experiments.experiment import Cell, Experiment, Places, rebuilt
 from experiments.origin import ROOT
+from experiments.paper import read_paper
 from experiments.store import Store, timed
 
 
@@ -26,8 +28,9 @@ class Chapter:
     Args:
         name: of the chapter and its folders under ``data/``.
         experiments: by the names of their files.
-        results_dir: where rows are, seen from the project; ``None``: in a folder that goes.
-        policies_dir: where policies are; ``None``: beside the rows.
+        results_dir: where rows are, seen from the working directory: ``data/results/NAME`` are the
+            shipped ones, wherever one works; ``None``: in a folder that goes. Policies follow the
+            rows: those of a folder of one's own are in its ``policies``.
         num_workers: processes that compute missing rows; ``None``: one per core.
     """
 
@@ -36,20 +39,35 @@ class Chapter:
         name: str,
         experiments: Mapping[str, Experiment],
         results_dir: str | None,
-        policies_dir: str | None = None,
         num_workers: int | None = None,
     ) -> None:
         plt.rcParams.update(figures.STYLE)
         torch.set_num_threads(1)  # small matrices: processes use the cores better than threads
         self.name, self.experiments = name, experiments
-        self.folder = ROOT / results_dir if results_dir else Path(tempfile.mkdtemp())
+        self._scratch = tempfile.TemporaryDirectory()
+        self.folder = self._folder_of(results_dir)
         self.workers = num_workers or os.cpu_count() or 1
-        shipped = results_dir and policies_dir
+        is_shipped = self.folder.resolve() == self.shipped
         self.places = Places(
             tables=ROOT / "data" / "tabulated",
-            policies=ROOT / policies_dir if shipped else self.folder / "policies",
+            policies=ROOT / "data" / "policies" / name if is_shipped else self.folder / "policies",
             checkpoints=self.folder / "checkpoints",
         )
+
+    @property
+    def shipped(self) -> Path:
+        """The folder of the rows that ship with the book."""
+        return ROOT / "data" / "results" / self.name
+
+    def _folder_of(self, results_dir: str | None) -> Path:
+        if results_dir is None:
+            return Path(self._scratch.name)
+        if not isinstance(results_dir, str) or not results_dir:
+            raise ValueError(
+                f"results_dir = {results_dir!r}: must be the path of a folder, or None"
+            )
+        is_default = Path(results_dir) == self.shipped.relative_to(ROOT)
+        return self.shipped if is_default else Path.cwd() / results_dir
 
     def rows(self, name: str, cells: Sequence[Cell], seeds: Sequence[int]) -> pd.DataFrame:
         """Rows of an experiment: shipped ones are loaded, missing ones are computed and kept."""
@@ -68,9 +86,14 @@ class Chapter:
         now = [timed(experiment.run, c, b["seeds"])[1] for c, b in zip(cells, batches, strict=True)]
         return pd.concat(now, ignore_index=True), store.rows()
 
-    def paper(self) -> pd.DataFrame:
-        """The paper's numbers."""
-        return pd.read_csv(ROOT / "data" / "paper" / f"{self.name}.csv", dtype={"domain": str})
+    def paper(self, table: str | None = None) -> pd.DataFrame:
+        """The paper's numbers; of doors in a further table, ``strategies``."""
+        return read_paper(f"{self.name}_{table}" if table else self.name)
+
+    def bench(self) -> dict[str, Any]:
+        """What the chapter's benchmark, under ``tests/bench``, wrote down."""
+        path = ROOT / "data" / "bench" / f"{self.name}.json"
+        return json.loads(path.read_text(encoding="utf-8"))
 
     def costs(self, *names: str) -> Styler:
         """What it took to compute experiments, from the record beside the rows of each."""

@@ -1,26 +1,23 @@
-"""Check-points: a tree of tensors and plain values in one file, which is whole or not used.
+"""Check-points: a tree of tensors and plain values in a sealed file, which is whole or not used.
 
-A file is the SHA-256 of what follows, a line feed, and a safetensors file whose metadata hold the
-plain values as JSON; it loads without executing code. The one before is kept beside it.
+The one before is kept beside it. What a check-point holds is lost with it, so it goes only when
+what was made of it is safe: see ``checkpoints`` of :class:`experiments.experiment.Experiment`.
 """
 
 from __future__ import annotations
 
-import hashlib
-import json
 import os
 import warnings
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import safetensors.torch
 import torch
 
-from experiments.files import replace_bytes
+from experiments.sealed import DamagedError
+from experiments.tensors import read_tensors, write_tensors
 
 TENSOR = "tensor:"  # what stands in the JSON for a tensor, before its name
-DIGEST_LENGTH = 64
 
 
 class CheckpointError(RuntimeError):
@@ -44,17 +41,16 @@ def save_checkpoint(path: str | Path, tree: Any) -> None:
     """
     path = Path(path)
     tensors: dict[str, torch.Tensor] = {}
-    plain = json.dumps(_take_tensors(tree, "", tensors))
-    content = safetensors.torch.save(tensors, {"tree": plain})
-    digest = hashlib.sha256(content).hexdigest().encode()
-    new = path.with_name(f"{path.name}.new")
+    plain = _take_tensors(tree, "", tensors)
+    new = _new(path)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        replace_bytes(new, digest + b"\n" + content)
+        write_tensors(new, tensors, "tree", plain)
         if path.exists():
             os.replace(path, previous(path))
         os.replace(new, path)
     except OSError as error:
+        if new.exists():
+            new.unlink()
         raise CheckpointError(
             f"{path}: cannot be written ({error.strerror}); the check-points before it are whole"
         ) from error
@@ -73,7 +69,7 @@ def load_checkpoint(path: str | Path) -> Any | None:
     for candidate in there:
         try:
             return _read(candidate)
-        except CheckpointError as error:
+        except DamagedError as error:
             warnings.warn(f"{error}; looking for the one before", CheckpointWarning, stacklevel=2)
     if there:
         raise CheckpointError(f"{path}: no check-point is whole; delete them to begin anew")
@@ -86,13 +82,19 @@ def previous(path: str | Path) -> Path:
     return path.with_name(f"{path.name}.previous")
 
 
+def files_of(path: Path) -> list[Path]:
+    """The check-point, the one before, and what a killed program may have left."""
+    return [path, previous(path), _new(path)]
+
+
+def _new(path: Path) -> Path:
+    """Where a check-point is written, before it takes the place of the present one."""
+    return path.with_name(f"{path.name}.new")
+
+
 def _read(path: Path) -> Any:
-    content = path.read_bytes()
-    digest, body = content[:DIGEST_LENGTH], content[DIGEST_LENGTH + 1 :]
-    if hashlib.sha256(body).hexdigest().encode() != digest:
-        raise CheckpointError(f"{path}: is cut short or changed")
-    header = json.loads(body[8 : 8 + int.from_bytes(body[:8], "little")])
-    return _put_tensors(json.loads(header["__metadata__"]["tree"]), safetensors.torch.load(body))
+    tensors, plain = read_tensors(path, "tree")
+    return _put_tensors(plain, tensors)
 
 
 def _take_tensors(tree: Any, name: str, tensors: dict[str, torch.Tensor]) -> Any:

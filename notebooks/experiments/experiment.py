@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import inspect
+import json
 import types
 import typing
 from collections.abc import Callable
@@ -54,8 +55,12 @@ class Experiment:
         short: the slice of a cell that ``make verify`` computes again: the same cell with few
             iterations, updates or doors. ``None`` for a cell of which another one has the slice.
         seeds: of the slice.
-        reads: ``reads(cell, seed)`` are the files that a run reads; ``None``: it reads none.
+        reads: ``reads(cell, seed)`` are the files that a run reads, each behind a seal
+            (:mod:`experiments.sealed`); ``None``: it reads none.
         runs_at_once: runs of a cell that are computed, and saved, together; ``None``: all.
+        checkpoints: ``checkpoints(cell, seed)`` are the files that carry the work of a run. It is
+            not the run that removes them but the store, when the rows are saved and read back.
+            ``None``: nothing is kept on the way.
     """
 
     run: Callable[..., pd.DataFrame]
@@ -64,11 +69,13 @@ class Experiment:
     seeds: tuple[int, ...] = (0, 1)
     reads: Callable[..., list[Path]] | None = None
     runs_at_once: int | None = None
+    checkpoints: Callable[..., list[Path]] | None = None
 
     def at(self, places: Places) -> Experiment:
         """The same, where the run function knows its folders."""
-        reads = places.bind(self.reads) if self.reads else None
-        return dataclasses.replace(self, run=places.bind(self.run), reads=reads)
+        functions = {"run": self.run, "reads": self.reads, "checkpoints": self.checkpoints}
+        bound = {name: places.bind(given) for name, given in functions.items() if given}
+        return dataclasses.replace(self, **bound)
 
 
 def rebuilt(kind: Any, value: Any) -> Any:
@@ -81,3 +88,28 @@ def rebuilt(kind: Any, value: Any) -> Any:
         hints = typing.get_type_hints(kind)
         return kind(**{name: rebuilt(hints[name], part) for name, part in value.items()})
     return tuple(value) if isinstance(value, list) else value
+
+
+def plain(tree: Any) -> Any:
+    """Values, dataclasses among them, as they come back from JSON."""
+    return json.loads(json.dumps(tree, default=dataclasses.asdict))
+
+
+def filled(kind: Any, recorded: Any) -> Any:
+    """A recorded dataclass with options that it did not have yet: their defaults were done."""
+    try:
+        return plain(rebuilt(kind, recorded))
+    except (TypeError, ValueError, KeyError, AttributeError):  # it has options that are no more
+        return recorded
+
+
+def difference(recorded: dict[str, Any], wanted: dict[str, Any], prefix: str = "") -> str:
+    """What differs between two trees of plain values, in words."""
+    parts = []
+    for key in sorted({*recorded, *wanted}):
+        old, new = recorded.get(key), wanted.get(key)
+        if isinstance(old, dict) and isinstance(new, dict):
+            parts.append(difference(old, new, f"{prefix}{key}."))
+        elif old != new:
+            parts.append(f"{prefix}{key} = {old!r}, asked for {new!r}")
+    return "; ".join(part for part in parts if part)

@@ -17,7 +17,8 @@ import torch
 from minigrid.core.constants import OBJECT_TO_IDX
 
 from experiments.experiment import Experiment
-from experiments.policies import load_policy, save_policy
+from experiments.files import check_file_name
+from experiments.policies import check_place, load_policy, save_policy
 from experiments.rows import tidy
 from experiments.tables import mean_and_std
 from experiments.tabulated import load_or_tabulate
@@ -74,6 +75,7 @@ class Cell:
     size: int = 5
 
     def __post_init__(self) -> None:
+        check_file_name("label", self.label)  # of policies
         check_choice("color_encoding", self.color_encoding, ENCODINGS)
         for color in self.train_colors:
             check_choice("train_colors", color, COLORS)
@@ -180,14 +182,25 @@ def run_cell(
 
     ``tables`` is the folder of tabulated tasks. The weights of the first ten runs are saved in
     ``policies``.
+
+    Raises:
+        ValueError: policies of other settings or runs are where these would be saved.
     """
+    saves = policies is not None and seeds[0] == 0
+    made_for = {"cell": cell, "seeds": seeds[:NUM_SAVED]}
+    if saves:
+        check_place(policy_path(policies, cell), made_for)
     task = Keys(tables, cell.color_encoding, cell.size)
     *_, (_, players) = task.train(cell, seeds)
-    if policies is not None and seeds[0] == 0:
+    if saves:
         first = [{name: w[:NUM_SAVED] for name, w in player.items()} for player in players]
-        about = {"cell": cell.name, "seeds": seeds[:NUM_SAVED]}
-        save_policy(Path(policies) / f"{cell.name}.safetensors", first, about)
+        save_policy(policy_path(policies, cell), first, made_for)
     return tidy(cell, seeds, evaluate(task, players, seeds))
+
+
+def policy_path(policies: str | Path, cell: Cell) -> Path:
+    """The file of a cell's first runs."""
+    return Path(policies) / f"{cell.name}.safetensors"
 
 
 def run_curve(cell: Cell, seeds: list[int], tables: str | Path) -> pd.DataFrame:
@@ -238,8 +251,8 @@ class Keys:
 
     def saved(self, cell: Cell, policies: Path) -> tuple[list[Weights], list[int]]:
         """Weights of the saved runs of a cell, a dictionary per player, and their seeds."""
-        path = policies / f"{cell.name}.safetensors"
-        players, about = load_policy(path, self.network, {"cell": cell.name})
+        path = policy_path(policies, cell)
+        players, about = load_policy(path, self.network, {"cell": cell})
         return players, about["seeds"]
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import hashlib
 import inspect
 import os
 import platform
@@ -39,13 +38,6 @@ def function(run: Callable) -> tuple[str, dict[str, Any]]:
     }
     module = run.__module__.removeprefix("experiments.")
     return f"{module}.{run.__qualname__}", options
-
-
-def file_digest(path: Path) -> str:
-    """Of a file's content; a file that is not there is said to be so."""
-    if not path.exists():
-        return "no such file"
-    return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
 
 
 def versions() -> dict[str, str]:

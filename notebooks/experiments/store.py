@@ -14,11 +14,13 @@ from __future__ import annotations
 
 import datetime
 import hashlib
+import io
+import itertools
 import json
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -28,18 +30,17 @@ from filelock import FileLock
 from tqdm import tqdm
 
 from experiments import origin
-from experiments.experiment import Cell, Experiment, rebuilt
-from experiments.files import replace_text
+from experiments.experiment import Cell, Experiment, difference, filled, plain
+from experiments.files import check_file_name, replace_text
+from experiments.rows import ResultsError, check_rows, types_of
+from experiments.sealed import digest_of
 from ipo.checks import check_counts
 
 KEYS = {"columns", "cell", "run", "options", "seeds", "reads", "num_rows", "sha256"}  # of a batch
+TYPES = {"str": str, "bool": bool, "int64": int, "float64": float}  # a bool is an int, too
 NO_ROWS = pd.DataFrame({"run": pd.Series(dtype=int)})
 
 Batch = dict[str, Any]
-
-
-class ResultsError(ValueError):
-    """Rows that cannot be used; nothing was changed."""
 
 
 class OriginError(ResultsError):
@@ -52,6 +53,9 @@ class Store:
 
     folder: Path
     name: str
+
+    def __post_init__(self) -> None:
+        check_file_name("name", self.name)
 
     @property
     def csv(self) -> Path:
@@ -98,10 +102,12 @@ class Store:
             num_workers: processes that compute; ``None`` leaves it to ``joblib.parallel_config``.
 
         Every finished batch is saved at once: after an interruption the next call goes on with
-        what is missing and ends with the same rows.
+        what is missing and ends with the same rows. Check-points are removed last, when the rows
+        of all runs have been read from the files.
 
         Raises:
-            ResultsError: files that are damaged, or a folder that cannot be written.
+            ResultsError: files that are damaged, a folder that cannot be written, or rows that
+                would not come back as they are; see :func:`experiments.rows.check_rows`.
             OriginError: rows of another cell, option, run function or input than asked for.
         """
         check_counts("seeds", seeds, minimum=0)
@@ -116,6 +122,7 @@ class Store:
             (cell, runs[i : i + size]) for cell, runs in lacking for i in range(0, len(runs), size)
         ]
         if missing:
+            self._check_storable([cell for cell, _ in missing])
             self._check_writable()
             jobs = (joblib.delayed(timed)(experiment.run, cell, runs) for cell, runs in missing)
             work = joblib.Parallel(n_jobs=num_workers, return_as="generator_unordered")(jobs)
@@ -124,8 +131,19 @@ class Store:
             ):
                 self._add(experiment, cell, new_rows, cost)
             rows, _ = self._read()
+        self._remove_checkpoints(experiment, cells, seeds)
         wanted = rows[rows["run"].isin(seeds)]
         return pd.concat([select(wanted, cell.columns) for cell in cells], ignore_index=True)
+
+    def _remove_checkpoints(
+        self, experiment: Experiment, cells: Sequence[Cell], seeds: Sequence[int]
+    ) -> None:
+        """Remove what carried work whose rows have been read from the files."""
+        if experiment.checkpoints:
+            for cell, seed in itertools.product(cells, seeds):
+                for path in experiment.checkpoints(cell, seed):
+                    if path.exists():  # a folder that is read-only forbids removing nothing
+                        path.unlink()
 
     def _read(self) -> tuple[pd.DataFrame, list[Batch]]:
         """Rows and batches, every batch checked against its rows."""
@@ -133,20 +151,27 @@ class Store:
         if not batches:  # or killed before the first batch was saved whole
             return NO_ROWS, []
         try:
-            columns = pd.read_csv(self.csv, nrows=0).columns
+            return self._parsed(self.csv.read_bytes(), types, batches), batches
+        except OSError as error:
+            raise ResultsError(f"{self.json.with_suffix('')}: cannot be read: {error}") from error
+
+    def _parsed(self, csv: bytes, types: dict[str, str], batches: list[Batch]) -> pd.DataFrame:
+        """The rows of a CSV, every batch checked; types are those of the record, never guessed."""
+        try:
+            columns = pd.read_csv(io.BytesIO(csv), nrows=0).columns
             if absent := [column for column in types if column not in columns]:
                 raise ResultsError(
                     f"{self.csv}: column {absent[0]!r} is missing; needs {list(types)}"
                 )
-            rows = pd.read_csv(self.csv, dtype=types, keep_default_na=False)
+            rows = pd.read_csv(io.BytesIO(csv), dtype=types, keep_default_na=False)
         except ResultsError:
             raise
-        except (ValueError, OSError) as error:
+        except ValueError as error:
             raise ResultsError(f"{self.json.with_suffix('')}: cannot be read: {error}") from error
         # Rows that no batch claims: the run was killed between the two renames. They are
         # computed again.
         parts = [self._checked(rows, batch) for batch in batches]
-        return pd.concat(parts, ignore_index=True), batches
+        return pd.concat(parts, ignore_index=True)
 
     def _record(self) -> tuple[dict[str, str], list[Batch]]:
         """The types of the columns, and the batches."""
@@ -183,7 +208,9 @@ class Store:
         if not chosen:
             return
         wanted = asked(experiment, cell, chosen)
-        recorded = {key: batch[key] for key in wanted} | {"cell": filled(experiment, batch["cell"])}
+        recorded = {key: batch[key] for key in wanted} | {
+            "cell": filled(experiment.cell, batch["cell"])
+        }
         recorded["reads"] = {
             name: read for name, read in batch["reads"].items() if name in wanted["reads"]
         }
@@ -225,33 +252,73 @@ class Store:
             order = [column for column in rows.columns if column != "value"]
             together = pd.concat([present, rows]) if len(present) else rows
             together = together.sort_values(order, kind="stable")[list(rows.columns)]
+            text = together.to_csv(index=False)
+            self._check_comes_back(cell, text.encode(), types_of(rows), batches)
             if not self.json.exists():  # a CSV without a JSON would be somebody else's
                 self.write_record(rows, [])
-            replace_text(self.csv, together.to_csv(index=False))
+            replace_text(self.csv, text)
             self.write_record(together, batches)
+
+    def _check_comes_back(
+        self, cell: Cell, csv: bytes, types: dict[str, str], batches: list[Batch]
+    ) -> None:
+        """Whether what is about to be written gives the same rows when it is read."""
+        not_saved = f"{self.csv}: rows of {cell.columns} were not saved"
+        recorded, _ = self._record()
+        if recorded not in ({}, types):
+            raise ResultsError(f"{not_saved}: they have {types}, those of the file {recorded}")
+        try:
+            self._parsed(csv, types, batches)
+        except ResultsError as error:
+            raise ResultsError(f"{not_saved}: they would not come back as they are") from error
 
     def write_record(self, rows: pd.DataFrame, batches: list[Batch]) -> None:
         """Replace the record of these rows."""
-        types = {column: _type(rows[column]) for column in rows.columns}
-        record = {"types": types, "batches": batches}
+        record = {"types": types_of(rows), "batches": batches}
         replace_text(self.json, json.dumps(record, indent=1) + "\n")
+
+    def _check_storable(self, cells: Sequence[Cell]) -> None:
+        """Whether what cells have in their columns is of types that come back, and of the file's.
+
+        A new file has the types of the first cell.
+        """
+        types, _ = self._record()
+        types = types or {column: type_of(value) for column, value in cells[0].columns.items()}
+        for cell in cells:
+            for column, value in cell.columns.items():
+                kind, wanted = type_of(value), types.get(column, "left out, as in the file")
+                if kind not in TYPES or kind != wanted:
+                    rule = wanted if kind in TYPES else f"one of {', '.join(TYPES)}"
+                    raise ResultsError(
+                        f"{self.csv}: {column} = {value!r} of {cell.columns}: must be {rule}"
+                    )
 
     def _check_writable(self) -> None:
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             tempfile.TemporaryFile(dir=self.folder).close()
         except OSError as error:
-            raise ResultsError(f"folder = {self.folder}: must be writable: {error}") from error
+            raise ResultsError(
+                f"folder = {self.folder}: must be writable, since rows of {self.name} are missing: "
+                f"{error}. Name another folder for the results"
+            ) from error
+
+
+def type_of(value: Any) -> str:
+    """The type of a value in a cell's columns, as the record names it; or its own name."""
+    known = (name for name, kind in TYPES.items() if isinstance(value, kind))
+    return next(known, type(value).__name__)
 
 
 def timed(run: Callable, cell: Cell, seeds: list[int]) -> tuple[Cell, pd.DataFrame, dict]:
-    """The rows of a run, values to nine digits, and what they cost."""
+    """The rows of a run, checked, values to nine digits, and what they cost."""
     wall, cpu = time.perf_counter(), time.process_time()
     rows = run(cell, seeds)
     cost = {
         "cpu_seconds": round(time.process_time() - cpu, 2),
         "wall_seconds": round(time.perf_counter() - wall, 2),
     }
+    check_rows(cell, seeds, rows)
     rows["value"] = [float(f"{value:.9g}") for value in rows["value"]]
     return cell, rows, cost
 
@@ -261,17 +328,8 @@ def asked(experiment: Experiment, cell: Cell, seeds: Sequence[int]) -> dict[str,
     name, options = origin.function(experiment.run)
     reads = experiment.reads or (lambda cell, seed: [])
     paths = [path for seed in seeds for path in reads(cell, seed)]
-    digests = {path.name: origin.file_digest(path) for path in paths}
-    made_of = {"cell": asdict(cell), "run": name, "options": options, "reads": digests}
-    return json.loads(json.dumps(made_of))
-
-
-def filled(experiment: Experiment, recorded: dict[str, Any]) -> dict[str, Any]:
-    """A recorded cell with options that it did not have yet: their defaults are what was done."""
-    try:
-        return json.loads(json.dumps(asdict(rebuilt(experiment.cell, recorded))))
-    except (TypeError, ValueError, KeyError):  # it has options that are no more
-        return recorded
+    digests = {path.name: digest_of(path) for path in paths}
+    return plain({"cell": cell, "run": name, "options": options, "reads": digests})
 
 
 def select(rows: pd.DataFrame, columns: dict[str, Any]) -> pd.DataFrame:
@@ -289,25 +347,8 @@ def digest(rows: pd.DataFrame) -> str:
     return hashlib.sha256("\n".join(sorted(lines)).encode()).hexdigest()[:16]
 
 
-def difference(recorded: dict[str, Any], wanted: dict[str, Any], prefix: str = "") -> str:
-    """What differs between two trees of plain values, in words."""
-    parts = []
-    for key in sorted({*recorded, *wanted}):
-        old, new = recorded.get(key), wanted.get(key)
-        if isinstance(old, dict) and isinstance(new, dict):
-            parts.append(difference(old, new, f"{prefix}{key}."))
-        elif old != new:
-            parts.append(f"{prefix}{key} = {old!r}, asked for {new!r}")
-    return "; ".join(part for part in parts if part)
-
-
 def _lacking(cell: Cell, seeds: Iterable[int], batches: list[Batch]) -> list[int]:
     have = {
         seed for batch in batches if batch["columns"] == cell.columns for seed in batch["seeds"]
     }
     return [seed for seed in seeds if seed not in have]
-
-
-def _type(column: pd.Series) -> str:
-    kinds = {"i": "int64", "u": "int64", "f": "float64", "b": "bool"}
-    return kinds.get(column.dtype.kind, "str")

@@ -1,9 +1,11 @@
-"""Tables of tasks, kept in files; one that its environment contradicts is made anew."""
+"""Tables of tasks, kept in files; one that is damaged, or not of its environment, is made anew."""
 
 from __future__ import annotations
 
 import hashlib
+import io
 import json
+import warnings
 from collections.abc import Callable
 from dataclasses import fields
 from importlib.metadata import version
@@ -13,25 +15,39 @@ import numpy as np
 from filelock import FileLock
 from gymnasium import Env
 
+from experiments.sealed import DamagedError, read_sealed, write_sealed
 from ipo.worlds.tabular import TabularTask, goal_reward, state_of, tabulate
 
 NUM_STEPS = 200  # of random episodes in which a table and its environment are compared
 
 
+class TableWarning(UserWarning):
+    """A table that cannot be used, or not be kept; it is made anew."""
+
+
 def load_or_tabulate(make_env: Callable[..., Env], folder: str | Path, **options) -> TabularTask:
-    """:func:`ipo.worlds.tabular.tabulate` ``make_env(**options)``, or the same from a file."""
+    """:func:`ipo.worlds.tabular.tabulate` ``make_env(**options)``, or the same from a file.
+
+    Where the folder cannot be written, the table is made each time, with a warning.
+    """
     made_by = f"{make_env.__module__}.{make_env.__qualname__}"
     key = json.dumps([made_by, options, version("minigrid")], sort_keys=True)
-    path = Path(folder) / f"{hashlib.sha256(key.encode()).hexdigest()[:16]}.npz"
-    path.parent.mkdir(parents=True, exist_ok=True)
+    path = Path(folder) / f"{hashlib.sha256(key.encode()).hexdigest()[:16]}.table"
     env = make_env(**options)
-    with FileLock(path.with_suffix(".lock")):  # others that want the same table wait for it
-        if path.exists() and agrees(task := _load(path), env):
-            return task
-        partial = path.with_suffix(".partial.npz")
-        np.savez_compressed(partial, **vars(tabulate(env)))
-        partial.replace(path)
-    return _load(path)
+    task = None
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with FileLock(path.with_suffix(".lock")):  # others that want the same table wait for it
+            task = _kept(path, env)
+            if task is None:
+                task = tabulate(env)
+                write_sealed(path, _archive(task))
+    except OSError as error:  # a checkout that is read-only, or a full disk
+        kept = _kept(path, env)
+        if kept is None:
+            warnings.warn(f"{path}: cannot be written ({error.strerror})", TableWarning, 2)
+        task = kept or task or tabulate(env)
+    return task
 
 
 def agrees(task: TabularTask, env: Env) -> bool:
@@ -58,6 +74,20 @@ def agrees(task: TabularTask, env: Env) -> bool:
     return True
 
 
-def _load(path: Path) -> TabularTask:
-    with np.load(path) as arrays:
-        return TabularTask(**{field.name: arrays[field.name] for field in fields(TabularTask)})
+def _kept(path: Path, env: Env) -> TabularTask | None:
+    """The table in a file, if there is one that can be used."""
+    if not path.exists():
+        return None
+    try:
+        with np.load(io.BytesIO(read_sealed(path))) as arrays:
+            task = TabularTask(**{field.name: arrays[field.name] for field in fields(TabularTask)})
+    except (DamagedError, KeyError) as error:  # KeyError: of code that had other fields
+        warnings.warn(f"{path}: is made anew: {error}", TableWarning, stacklevel=3)
+        return None
+    return task if agrees(task, env) else None
+
+
+def _archive(task: TabularTask) -> bytes:
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **vars(task))
+    return buffer.getvalue()

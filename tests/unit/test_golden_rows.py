@@ -7,7 +7,8 @@ import pandas as pd
 import pytest
 
 from experiments import lqr
-from experiments.store import Store, asked, filled
+from experiments.experiment import filled
+from experiments.store import Store, asked
 
 DATA = Path(__file__).resolve().parents[2] / "data"
 RESULTS = DATA / "results" / "lqr"
@@ -84,7 +85,7 @@ def test_rows_are_whole_and_what_the_chapter_asks_for(name):
     store.rows()  # each batch is checked against its digest
     batches = store.batches()
     recorded = [
-        {key: batch[key] for key in wanted[0]} | {"cell": filled(experiment, batch["cell"])}
+        {key: batch[key] for key in wanted[0]} | {"cell": filled(experiment.cell, batch["cell"])}
         for batch in batches
     ]
     assert sorted(map(json.dumps, recorded)) == sorted(map(json.dumps, wanted))

@@ -1,8 +1,10 @@
 """Results with provenance: loaded, computed where missing, never lost, never wrong unnoticed."""
 
+import errno
 import functools
 import json
 import os
+import pickle
 import re
 import signal
 import subprocess
@@ -17,6 +19,7 @@ import toy_experiment
 from toy_experiment import CELLS, SEEDS, Cell, fill
 
 from experiments.experiment import Experiment
+from experiments.sealed import DamagedError, write_sealed
 from experiments.store import OriginError, ResultsError, Store
 
 
@@ -326,22 +329,23 @@ def test_rows_of_another_option_are_refused(tmp_path):
 
 def test_rows_of_another_input_are_refused(tmp_path):
     path = tmp_path / "inputs" / "policy"
-    path.parent.mkdir()
-    path.write_bytes(b"weights")
+    write_sealed(path, b"weights")
     folder = tmp_path / "rows"
     fill(folder, reads=input_of(path))
     fill(folder, reads=input_of(path))
-    path.write_bytes(b"other weights")
+    write_sealed(path, b"other weights")
     refused(folder, r"reads\.policy = '\w{16}', asked for '\w{16}'", reads=input_of(path))
+    path.write_bytes(path.read_bytes()[:-1])
+    with pytest.raises(DamagedError, match="policy: is cut short or changed"):
+        fill(folder, reads=input_of(path))
     path.unlink()
     refused(folder, r"reads\.policy = '\w{16}', asked for 'no such file'", reads=input_of(path))
 
 
 def test_runs_that_nobody_asks_for_need_no_inputs(tmp_path):
-    path = tmp_path / "policy"
-    path.write_bytes(b"weights")
-    by_seed = tmp_path / "other"
-    by_seed.write_bytes(b"weights")
+    path, by_seed = tmp_path / "policy", tmp_path / "other"
+    for file in (path, by_seed):
+        write_sealed(file, b"weights")
     fill(tmp_path / "rows", reads=lambda cell, seed: [path if seed else by_seed])
     by_seed.unlink()
     again = fill(tmp_path / "rows", seeds=[1, 2], reads=lambda cell, seed: [path])
@@ -361,12 +365,112 @@ def test_other_cells_of_a_file_do_not_matter(tmp_path):
     assert len(fill(tmp_path, [CELLS[1], CELLS[2]])) == 12
 
 
-@pytest.mark.parametrize("label", ["NA", "None", "1", "nan", "a,b", ""])
-def test_labels_come_back_as_they_were(tmp_path, label):
-    cells = [Cell(label, 2)]
+@pytest.mark.parametrize("label", ["NA", "None", "1", "nan", "a,b", "", "a\nb", "a\r\nb", '"', "é"])
+@pytest.mark.parametrize("others", [(), CELLS])
+def test_labels_come_back_as_they_were(tmp_path, label, others):
+    cells = [*others, Cell(label, 2)]
     first = fill(tmp_path, cells)
     pd.testing.assert_frame_equal(fill(tmp_path, cells), first)
-    assert set(first["method"]) == {label}
+    assert set(fill(tmp_path, cells[-1:])["method"]) == {label}
+
+
+# -------------------------------------------------------------- rows that would not come back
+
+
+@pytest.mark.parametrize(
+    ("cell", "message"),
+    [
+        (Cell(None, 2), r"method = None of .*: must be one of str, bool, int64, float64"),
+        (Cell(1, 2), r"method = 1 of .*: must be str"),
+        (Cell("new", "2"), r"size = '2' of .*: must be int64"),
+        (Cell("new", 2.0), r"size = 2\.0 of .*: must be int64"),
+        (Cell("new", True), r"size = True of .*: must be int64"),
+    ],
+)
+def test_a_label_of_another_type_is_refused_before_any_work(folder, cell, message):
+    before, calls = contents(folder), Calls()
+    with pytest.raises(ResultsError, match=rf"toy\.csv: {message}"):
+        fill(folder, [*CELLS, cell], run=calls)
+    assert calls.asked == [] and contents(folder) == before
+
+
+BAD_ROWS = {
+    "a column is missing": (lambda rows: rows.drop(columns="size"), "column 'size' is missing"),
+    "no runs": (lambda rows: rows.drop(columns="run"), "column 'run' is missing"),
+    "no values": (lambda rows: rows.drop(columns="value"), "column 'value' is missing"),
+    "no rows": (lambda rows: rows[:0], "there are none"),
+    "NaN": (lambda rows: rows.assign(value=float("nan")), "'value' has no value, or NaN, in 6"),
+    "no domain": (lambda rows: rows.assign(domain=None), "'domain' has no value, or NaN, in 6"),
+    "kinds": (lambda rows: rows.assign(domain=[*"abcde", 1]), "column 'domain' has 1, must be all"),
+    "other runs": (lambda rows: rows.assign(run=rows["run"] + 1), r"they are of runs \[1, 2, 3\]"),
+    "a run is missing": (lambda rows: rows[rows["run"] > 0], r"they are of runs \[1, 2\]"),
+    "other cell": (lambda rows: rows.assign(method="old"), "method = 'old', must be 'new'"),
+    "twice": (lambda rows: pd.concat([rows, rows]), r"two of them are of \{'method': 'new'"),
+    "a column more": (lambda rows: rows.assign(more=1), "were not saved: they have .*'more'"),
+    "integers": (lambda rows: rows.assign(domain=range(6)), "were not saved: .*'domain': 'int64'"),
+    "line feed": (lambda rows: rows.assign(metric="a\rb"), "would not come back as they are"),
+}
+
+
+@pytest.mark.parametrize(("change", "message"), BAD_ROWS.values(), ids=BAD_ROWS.keys())
+def test_rows_that_would_not_come_back_are_not_saved(folder, change, message):
+    @functools.wraps(toy_experiment.run)
+    def run(cell, seeds):
+        return change(toy_experiment.run(cell, seeds))
+
+    before = contents(folder)
+    with pytest.raises(ResultsError, match=rf"rows of {{'method': 'new', 'size': 3}}.*{message}"):
+        fill(folder, [Cell("new", 3)], run=run)
+    assert contents(folder) == before
+    assert len(fill(folder, [*CELLS, Cell("new", 3)])) == 24  # nothing is blocked
+
+
+@pytest.mark.parametrize("name", ["../toy", "deeper/toy", "/toy", "..", ".", "", "a\\b", "a\0"])
+def test_a_name_with_a_path_in_it_is_refused(tmp_path, name):
+    with pytest.raises(ValueError, match=r"name = .*: must be the name of a file, without a path"):
+        Store(tmp_path, name)
+
+
+# -------------------------------------------------------------------------- work on the way
+
+
+def test_work_is_kept_until_its_rows_are_read_back(tmp_path, complete, monkeypatch):
+    """The disk is full when rows are to be saved: the next call finishes from the check-points."""
+    begun = []
+
+    @functools.wraps(toy_experiment.run)
+    def run(cell, seeds):
+        (seed,) = seeds
+        (path,) = files(cell, seed)
+        if not path.exists():
+            begun.append(path.name)
+            path.write_bytes(pickle.dumps(toy_experiment.run(cell, seeds)))
+        return pickle.loads(path.read_bytes())
+
+    def files(cell, seed):
+        return [tmp_path / f"{cell.method}_{cell.size}_{seed}.work"]
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    rows, options = tmp_path / "rows", {"run": run, "checkpoints": files, "runs_at_once": 1}
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "replace", full)
+        with pytest.raises(OSError, match="No space left"):
+            fill(rows, **options)
+    assert begun == ["slow_2_0.work"] and list(tmp_path.glob("*.work"))
+    assert contents(rows) == {}
+    fill(rows, **options)
+    assert len(begun) == len(set(begun)) == 9  # none began anew
+    assert contents(rows)["toy.csv"] == contents(complete)["toy.csv"]
+    assert list(tmp_path.glob("*.work")) == []
+
+
+def test_work_left_by_a_program_that_died_before_removing_it_goes(folder):
+    path = folder / "left.work"
+    path.write_text("work")
+    assert len(fill(folder, checkpoints=lambda cell, seed: [path])) == 18
+    assert not path.exists()
 
 
 def test_record_is_json_that_others_can_read(folder):

@@ -13,12 +13,13 @@ from tqdm import tqdm
 from experiments.doors import training as door_training
 from experiments.doors.training import (
     EVALUATION_SEED,
+    NETWORK,
     TRAIN_FRICTIONS,
     last_info,
-    load_players,
     policy_path,
 )
-from experiments.experiment import Experiment
+from experiments.experiment import Experiment, rebuilt
+from experiments.policies import load_policy
 from experiments.rows import tidy
 from ipo.checks import check_count
 from ipo.networks import Weights
@@ -58,7 +59,7 @@ def gains_alone(cell: Cell, seeds: Sequence[int], policies: str | Path) -> pd.Da
     """
     parts = []
     for seed in seeds:
-        players = load_players(policies, cell.trained.label, seed, cell.updates, "last")
+        players = load_players(policies, cell, seed)
         metrics = {}
         for d, friction in enumerate(TRAIN_FRICTIONS):
             for name, own in (("before", players), ("after", gone_on(cell, seed, players, d))):
@@ -66,6 +67,21 @@ def gains_alone(cell: Cell, seeds: Sequence[int], policies: str | Path) -> pd.Da
                 metrics[str(friction), name] = [found["episode_return"].mean()]
         parts.append(tidy(cell, [seed], metrics))
     return pd.concat(parts, ignore_index=True)
+
+
+def load_players(policies: str | Path, cell: Cell, seed: int) -> list[Weights]:
+    """The last policy of a run, trained as the cell says; a slice goes on with shorter rollouts.
+
+    Raises:
+        ValueError: a file that is no policy for doors, or that was not made for this run.
+    """
+    (path,) = reads(cell, seed, policies)
+    made_for = {"seed": seed, "updates": cell.updates, "choice": "last"}
+    players, about = load_policy(path, NETWORK, made_for)
+    settings = rebuilt(door_training.Cell, about["settings"]).settings
+    if cell.trained.settings not in (settings, door_training.shorter(settings)):
+        raise ValueError(f"{path}: was made with {settings}, not with {cell.trained.settings}")
+    return players
 
 
 def gone_on(cell: Cell, seed: int, players: Sequence[Weights], d: int) -> list[Weights]:

@@ -123,9 +123,7 @@ def evaluate(cell: Cell, seeds: Sequence[int], policies: str | Path) -> pd.DataF
 
 def load_players(cell: Cell, seed: int, policies: str | Path) -> list[Weights]:
     """The players of a run who act."""
-    players = door_training.load_players(
-        policies, cell.trained.label, seed, cell.updates, cell.choice
-    )
+    players = door_training.load_players(policies, cell.trained, seed, cell.updates, cell.choice)
     return players if cell.player is None else [players[cell.player]]
 
 

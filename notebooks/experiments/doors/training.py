@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -17,9 +17,10 @@ import pandas as pd
 import torch
 from tqdm import tqdm
 
-from experiments.checkpoints import CheckpointError, load_checkpoint, save_checkpoint
-from experiments.experiment import Experiment
-from experiments.policies import load_policy, save_policy
+from experiments.checkpoints import CheckpointError, files_of, load_checkpoint, save_checkpoint
+from experiments.experiment import Experiment, plain
+from experiments.files import check_file_name
+from experiments.policies import check_place, load_policy, save_policy
 from ipo.distributions import Gaussian
 from ipo.networks import DenseNetwork, Weights, copied
 from ipo.ppo import PPOSettings, Training
@@ -75,6 +76,7 @@ class Cell:
     curve_every: int = 10
 
     def __post_init__(self) -> None:
+        check_file_name("label", self.label)  # of policies and check-points
         for updates in self.saved_after:
             if not 0 < updates <= self.settings.num_updates:
                 raise ValueError(
@@ -107,7 +109,8 @@ def train_run(
 ) -> pd.DataFrame:
     """Train one run, or go on where it was interrupted; save its policies; its learning curve.
 
-    The state is saved after every update in ``checkpoints``, and removed in the end.
+    The state is saved after every update in ``checkpoints``, and stays there in the end: it is all
+    that there is until the rows are saved, and then the store removes it.
 
     Returns:
         rows with the cell's columns, ``frames``, ``run``, ``domain``, ``metric`` and ``value``.
@@ -117,6 +120,7 @@ def train_run(
 
     Raises:
         CheckpointError: a check-point of other settings, or one that cannot be written.
+        ValueError: policies of other settings are where these would be saved.
     """
     (seed,) = seeds
     run = Run(cell, seed, Path(checkpoints), Path(policies))
@@ -132,7 +136,6 @@ def train_run(
         while run.num_updates < cell.settings.num_updates:
             run.update()
             bar.update()
-    run.remove_checkpoints()
     return run.rows()
 
 
@@ -141,18 +144,17 @@ class Run:
 
     def __init__(self, cell: Cell, seed: int, checkpoints: Path, policies: Path) -> None:
         self.cell, self.seed, self.policies = cell, seed, policies
-        self.checkpoint = checkpoints / f"{cell.label}_{seed}.checkpoint"
+        self.checkpoint = checkpoint_path(cell, seed, checkpoints)
         self.training = new_training(cell.settings, seed)
         self.num_updates = 0
         self.cpu_seconds = 0.0
         self.best_return = -np.inf
         self.best: list[Weights] = []
         self.curve: list[list[Any]] = []  # frames, domain, metric, value
-        # Plain values, as they come back from JSON.
-        self.identity = {
-            "settings": listed(asdict(cell)),
-            "seed": seed,
-        }
+        self.identity = plain({"settings": cell, "seed": seed})
+        for updates in cell.saved_after:
+            for choice in CHOICES:
+                check_place(*self._policy(updates, choice))
         state = load_checkpoint(self.checkpoint)
         if state is not None:
             self._restore(state)
@@ -185,10 +187,6 @@ class Run:
             for frames, domain, metric, value in self.curve
         )
 
-    def remove_checkpoints(self) -> None:
-        for path in self.checkpoint.parent.glob(f"{self.checkpoint.name}*"):
-            path.unlink()
-
     def _note(self, domain: float | str, metric: str, value: float) -> None:
         self.curve.append([self.training.num_frames, domain, metric, float(value)])
 
@@ -216,17 +214,20 @@ class Run:
         if last > self.best_return:
             self.best_return, self.best = last, copied(self.training.players)
 
+    def _policy(self, updates: int, choice: str) -> tuple[Path, dict[str, Any]]:
+        """Where a policy is, and what it is made for."""
+        path = policy_path(self.policies, self.cell.label, self.seed, updates, choice)
+        return path, made_for(self.cell, self.seed, updates, choice)
+
     def _save_policies(self) -> None:
-        about = {
-            **self.identity,
-            "updates": self.num_updates,
+        notes = {
             "frames": self.training.num_frames,
             "cpu_seconds": round(self.cpu_seconds, 1),
             "versions": {name: version(name) for name in ("torch", "numpy", "mujoco")},
         }
         for choice, players in (("best", self.best), ("last", self.training.players)):
-            path = policy_path(self.policies, self.cell.label, self.seed, self.num_updates, choice)
-            save_policy(path, players, about | {"choice": choice})
+            path, about = self._policy(self.num_updates, choice)
+            save_policy(path, players, about, notes)
 
     def _state(self) -> dict[str, Any]:
         return {
@@ -288,26 +289,34 @@ def last_info(
         doors.close()
 
 
+def checkpoint_path(cell: Cell, seed: int, checkpoints: str | Path) -> Path:
+    """The check-point of a run."""
+    return Path(checkpoints) / f"{cell.label}_{seed}.checkpoint"
+
+
+def checkpoints_of(cell: Cell, seed: int, checkpoints: str | Path) -> list[Path]:
+    return files_of(checkpoint_path(cell, seed, checkpoints))
+
+
 def policy_path(
     folder: str | Path, label: str, seed: int, num_updates: int, choice: str = "best"
 ) -> Path:
     """The file of a run's policy after so many updates."""
+    check_file_name("label", label)
     return Path(folder) / f"{label}_{seed}_{num_updates}_{choice}.safetensors"
 
 
+def made_for(cell: Cell, seed: int, num_updates: int, choice: str) -> dict[str, Any]:
+    """What a policy's file says about it."""
+    return {"settings": cell, "seed": seed, "updates": num_updates, "choice": choice}
+
+
 def load_players(
-    folder: str | Path, label: str, seed: int, num_updates: int, choice: str = "best"
+    folder: str | Path, cell: Cell, seed: int, num_updates: int, choice: str = "best"
 ) -> list[Weights]:
     """The players of a run, from its file."""
-    path = policy_path(folder, label, seed, num_updates, choice)
-    return load_policy(path, NETWORK, {"seed": seed, "choice": choice})[0]
-
-
-def listed(tree: Any) -> Any:
-    """A tree with lists for tuples, as JSON has it."""
-    if isinstance(tree, dict):
-        return {key: listed(part) for key, part in tree.items()}
-    return [listed(part) for part in tree] if isinstance(tree, list | tuple) else tree
+    path = policy_path(folder, cell.label, seed, num_updates, choice)
+    return load_policy(path, NETWORK, made_for(cell, seed, num_updates, choice))[0]
 
 
 def shorter(settings: PPOSettings) -> PPOSettings:
@@ -321,4 +330,4 @@ def short(cell: Cell) -> Cell:
     return replace(cell, settings=settings, saved_after=(1,), curve_every=1)
 
 
-EXPERIMENT = Experiment(train_run, Cell, short, (0,), runs_at_once=1)
+EXPERIMENT = Experiment(train_run, Cell, short, (0,), runs_at_once=1, checkpoints=checkpoints_of)
