@@ -186,7 +186,7 @@ def run_cell(
     Raises:
         ValueError: policies of other settings or runs are where these would be saved.
     """
-    saves = policies is not None and seeds[0] == 0
+    saves = policies is not None and seeds[:1] == [0]
     made_for = {"cell": cell, "seeds": seeds[:NUM_SAVED]}
     if saves:
         check_place(policy_path(policies, cell), made_for)

@@ -7,6 +7,8 @@ import nbformat
 import pytest
 import yaml
 
+import execute
+
 NOTEBOOKS = Path(__file__).resolve().parents[2] / "notebooks"
 SOURCES = [path for path in sorted(NOTEBOOKS.rglob("*.ipynb")) if "checkpoint" not in path.name]
 
@@ -64,3 +66,44 @@ def test_begins_with_a_title(notebook):
 def test_every_profile_names_existing_notebooks(profile):
     parameters = yaml.safe_load((NOTEBOOKS / "profiles" / f"{profile}.yml").read_text())
     assert parameters.keys() <= {path.stem for path in SOURCES}
+
+
+# ------------------------------------------------------------------------------ what is read
+
+# Modules that may read files, each with a check of what it finds, or of what comes from elsewhere.
+READERS = {
+    "store",  # rows
+    "sealed",  # policies, check-points, tables
+    "files",  # what it has just written
+    "paper",  # the paper's numbers
+    "chapter",  # what a benchmark wrote
+    "confirm",  # its own record
+    "pictures",  # a film that was just made
+}
+READING = re.compile(
+    r"\bread_(?:csv|json|text|bytes|table|pickle|parquet)\(|\bopen\(|\bsafe_open\(|\bload_file\("
+    r"|\b(?:np|numpy)\.(?:load|loadtxt|genfromtxt|fromfile)\((?!io\.BytesIO)|\bZipFile\("
+)
+PLACE = re.compile(r"""(?:\bDATA|"data")\s*/\s*"(\w+)"|["']data/(\w+)""")
+MODULES = {
+    ".".join(path.relative_to(NOTEBOOKS / "experiments").with_suffix("").parts): path.read_text()
+    for path in (NOTEBOOKS / "experiments").rglob("*.py")
+}
+CODE = MODULES | {
+    path.name: "\n".join(
+        cell.source for cell in nbformat.read(path, as_version=4).cells if cell.cell_type == "code"
+    )
+    for path in SOURCES
+}
+
+
+def test_nothing_is_read_past_the_store():
+    """All other code gets rows, policies and the paper's numbers from one of the readers."""
+    assert {name for name, code in CODE.items() if READING.search(code)} == READERS
+
+
+def test_all_that_is_read_makes_a_notebook_run_again():
+    """Folders of data/ are in the fingerprint of every notebook, but for those made on the way."""
+    named = {a or b for code in CODE.values() for a, b in PLACE.findall(code)}
+    on_the_way = {"tabulated", "confirmed", "reproduced"}  # a cache; a page's record; outputs
+    assert named - on_the_way == set(execute.DATA)

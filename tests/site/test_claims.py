@@ -13,6 +13,7 @@ import scipy.stats
 from stored_rows import store_rows
 
 import claims
+from experiments.sealed import DamagedError
 from experiments.store import ResultsError, Store
 from rules import RULES
 
@@ -96,6 +97,13 @@ def test_a_verdict_is_not_flipped_by_hand(data):
     path = data / "results" / "lqr" / "tables.csv"
     path.write_text(path.read_text().replace("97.", "57.", 1))
     with pytest.raises(ResultsError, match=r"tables\.csv: the rows .* are cut short or changed"):
+        claims.decide_all(data)
+
+
+def test_a_number_of_the_paper_is_not_changed_by_hand(data):
+    path = data / "paper" / "lqr.csv"
+    path.write_text(path.read_text().replace("97.7", "57.7", 1))
+    with pytest.raises(DamagedError, match=r"lqr\.csv: is not as SHA256SUMS beside it has it"):
         claims.decide_all(data)
 
 

@@ -19,6 +19,7 @@ from test_bad_input import INF, LEAST_1, NAN, WHOLE, named
 import ipo  # noqa: F401  (registers the environment)
 from experiments.keys import Cell, encode, published, run_cell
 from experiments.policies import load_policy, save_policy
+from experiments.sealed import DamagedError, write_sealed
 from experiments.tabulated import load_or_tabulate
 from ipo.networks import GridNetwork, Weights
 from ipo.ppo import PPOSettings, Training
@@ -66,7 +67,7 @@ def test_environment_that_cannot_be(name, value, error, rule):
 def test_no_table_of_an_environment_that_cannot_be(tmp_path, options, message):
     with pytest.raises(ValueError, match=message):
         load_or_tabulate(ColoredKeysEnv, tmp_path, **options)
-    assert list(tmp_path.glob("*.npz")) == []
+    assert list(tmp_path.glob("*.table")) == []
 
 
 def test_no_table_of_a_random_environment(tmp_path, monkeypatch):
@@ -80,7 +81,7 @@ def test_no_table_of_a_random_environment(tmp_path, monkeypatch):
     monkeypatch.setattr(ColoredKeysEnv, "step", drifting)
     with pytest.raises(NotTabularError, match=r"^env = .*: must be deterministic, but action 0"):
         load_or_tabulate(ColoredKeysEnv, tmp_path, color="red")
-    assert list(tmp_path.glob("*.npz")) == []
+    assert list(tmp_path.glob("*.table")) == []
 
 
 # ----------------------------------------------------------------------------- settings
@@ -329,14 +330,14 @@ def test_policy_for_another_network(tmp_path, network):
 @pytest.mark.parametrize(
     ("about", "message"),
     [
-        ({"cell": "ppo_green"}, "was made for cell = 'ppo_red', not 'ppo_green'"),
-        ({"cell": "ppo_red", "seeds": [0]}, r"was made for seeds = \[0, 1\], not \[0\]"),
-        ({"size": 6}, "was made for size = None, not 6"),
+        ({"cell": "ppo_green"}, "cell = 'ppo_red', asked for 'ppo_green'"),
+        ({"cell": "ppo_red", "seeds": [0]}, r"seeds = \[0, 1\], asked for \[0\]"),
+        ({"size": 6}, "size = None, asked for 6"),
     ],
 )
 def test_policy_that_was_made_for_something_else(tmp_path, about, message):
     path = saved(tmp_path)
-    with pytest.raises(ValueError, match=rf"^{path}: {message}"):
+    with pytest.raises(ValueError, match=rf"^{path}: was made for something else: {message}"):
         load_policy(path, NETWORK, about)
 
 
@@ -345,14 +346,28 @@ def test_policy_cut_short(tmp_path, share):
     path = saved(tmp_path)
     content = path.read_bytes()
     path.write_bytes(content[: int(share * len(content))])
-    with pytest.raises(ValueError, match=rf"^{path}: cannot be read as a policy: "):
+    with pytest.raises(DamagedError, match=rf"^{path}: is cut short or changed"):
         load_policy(path, NETWORK)
+
+
+def test_every_changed_bit_of_a_policy_is_found(tmp_path):
+    """All bits of the seal, of what follows it and of the header's length; a sample of the rest."""
+    path = saved(tmp_path)
+    content = path.read_bytes()
+    rng = np.random.default_rng(0)
+    places = [*range(75), *rng.integers(75, len(content), 125)]
+    for place in places:
+        changed = bytearray(content)
+        changed[place] ^= 1 << int(rng.integers(8))
+        path.write_bytes(changed)
+        with pytest.raises(DamagedError, match=rf"^{path}: is cut short or changed"):
+            load_policy(path, NETWORK)
 
 
 def test_policy_of_another_format(tmp_path):
     path = tmp_path / "policy.safetensors"
     torch.save({"0.conv1.weight": torch.zeros(1)}, path)
-    with pytest.raises(ValueError, match=rf"^{path}: cannot be read as a policy: "):
+    with pytest.raises(DamagedError, match=rf"^{path}: is cut short or changed"):
         load_policy(path, NETWORK)
 
 
@@ -362,18 +377,20 @@ def test_policy_that_does_not_exist(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("tensors", "metadata"),
+    ("names", "metadata", "message"),
     [
-        ({"0.conv1.weight": torch.zeros(1, 12, 16)}, None),
-        ({"0.conv1.weight": torch.zeros(1, 12, 16)}, {"cell": "ppo_red"}),
-        ({"weight": torch.zeros(1)}, {"about": "{}"}),
-        ({}, {"about": "{}"}),
-        ({"0.conv1.weight": torch.zeros(1)}, {"about": "{"}),
+        (["0.conv1.weight"], None, "holds no 'about' with its tensors"),
+        (["0.conv1.weight"], {"cell": "ppo_red"}, "holds no 'about' with its tensors"),
+        (["0.conv1.weight"], {"about": "{"}, "holds no 'about' with its tensors"),
+        ([], {"about": "{}"}, "must hold .* weights of each player"),
+        (["weight"], {"about": "{}"}, "conv1.weight of player 0 has shape nothing"),
+        (["999999999.conv1.weight"], {"about": "{}"}, "conv1.weight of player 0 has shape nothing"),
+        ([f"0.{n}" for n in range(20)], {"about": "{}"}, "must hold 14 weights of each player"),
     ],
-    ids=["says nothing", "says something else", "foreign names", "no weights", "damaged record"],
 )
-def test_file_that_is_no_policy(tmp_path, tensors, metadata):
+def test_sealed_file_that_is_no_policy(tmp_path, names, metadata, message):
     path = tmp_path / "policy.safetensors"
-    safetensors.torch.save_file(tensors, path, metadata)
-    with pytest.raises(ValueError, match=rf"^{path}: cannot be read as a policy"):
+    tensors = {name: torch.zeros(1, 12, 16) for name in names}
+    write_sealed(path, safetensors.torch.save(tensors, metadata))
+    with pytest.raises(ValueError, match=rf"^{path}: {message}"):
         load_policy(path, NETWORK)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+import experiments.store
 from experiments.checkpoints import (
     CheckpointError,
     CheckpointWarning,
@@ -20,7 +21,9 @@ from experiments.checkpoints import (
 )
 from experiments.doors import training as door_training
 from experiments.doors.training import NETWORK, Cell, Run, published_door, train_run
+from experiments.experiment import Places
 from experiments.policies import load_policy
+from experiments.store import Store
 
 TREE = {
     "number": 3,
@@ -50,21 +53,22 @@ def test_nothing_saved_is_nothing(tmp_path):
     assert load_checkpoint(tmp_path / "c") is None
 
 
-@pytest.mark.parametrize("damage", ["cut", "byte", "empty", "text"])
-def test_a_damaged_file_is_passed_over_with_a_message(tmp_path, damage):
+def test_a_damaged_file_is_passed_over_with_a_message(tmp_path):
+    """Cut, empty, something else, and one bit of every byte changed."""
     path = tmp_path / "c"
     save_checkpoint(path, {"number": 1})
     save_checkpoint(path, {"number": 2})
     content = path.read_bytes()
-    changed = {
-        "cut": content[:-5],
-        "byte": content[:-3] + bytes([content[-3] ^ 1]) + content[-2:],
-        "empty": b"",
-        "text": b"not a check-point",
-    }[damage]
-    path.write_bytes(changed)
-    with pytest.warns(CheckpointWarning, match="is cut short or changed; looking for the one"):
-        assert load_checkpoint(path) == {"number": 1}
+    flipped = [
+        content[:i] + bytes([byte ^ 1 << i % 8]) + content[i + 1 :]
+        for i, byte in enumerate(content)
+    ]
+    for changed in (content[:-5], b"", b"not a check-point", *flipped):
+        path.write_bytes(changed)
+        with pytest.warns(
+            CheckpointWarning, match="is cut short or changed.*; looking for the one"
+        ):
+            assert load_checkpoint(path) == {"number": 1}
 
 
 def test_two_damaged_files_are_an_error(tmp_path):
@@ -80,14 +84,15 @@ def test_two_damaged_files_are_an_error(tmp_path):
         load_checkpoint(path)
 
 
-def test_a_full_disk_leaves_what_was_there(tmp_path, monkeypatch):
+def full(*_):
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+@pytest.mark.parametrize("call", ["fsync", "replace"])
+def test_a_full_disk_leaves_what_was_there(tmp_path, monkeypatch, call):
     path = tmp_path / "c"
     save_checkpoint(path, {"number": 1})
-
-    def full(_):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(os, "fsync", full)
+    monkeypatch.setattr(os, call, full)
     with pytest.raises(CheckpointError, match=r"cannot be written \(No space left on device\)"):
         save_checkpoint(path, {"number": 2})
     assert load_checkpoint(path) == {"number": 1}
@@ -129,12 +134,28 @@ def test_an_interrupted_run_ends_as_if_nothing_had_happened(tmp_path):
         )
         for d, player in enumerate(one):
             assert all(torch.equal(w, other[d][n]) for n, w in player.items())
-    assert not list((tmp_path / "a").iterdir())
+
+
+def test_a_training_is_kept_until_its_rows_are_saved(tmp_path, monkeypatch):
+    """The disk is full in the end: the next call trains no more, and has the same rows."""
+    places = Places(tmp_path, tmp_path / "policies", tmp_path / "checkpoints")
+    experiment = door_training.EXPERIMENT.at(places)
+    store, cells = Store(tmp_path / "rows", "curves"), [small("ppo", 2)]
+    with monkeypatch.context() as patched:
+        patched.setattr(experiments.store, "replace_text", full)
+        with pytest.raises(OSError, match="No space left"):
+            store.fill(experiment, cells, [0], num_workers=1)
+    expected = Run(cells[0], 0, places.checkpoints, places.policies).rows()
+    monkeypatch.setattr(Run, "update", full)
+    rows = store.fill(experiment, cells, [0], num_workers=1)
+    assert len(rows) == len(expected)
+    assert sorted(rows["value"]) == pytest.approx(sorted(expected["value"]), rel=1e-8)
+    assert list(places.checkpoints.iterdir()) == []
 
 
 def test_a_shorter_training_is_the_beginning_of_a_longer_one(tmp_path):
     short, long = (
-        train_run(small(num_updates=n), [0], tmp_path / str(n), tmp_path / "p", progress=False)
+        train_run(small(num_updates=n), [0], tmp_path / str(n), tmp_path / str(n), progress=False)
         for n in (2, 3)
     )
     assert without_time(short).equals(without_time(long)[: len(without_time(short))])

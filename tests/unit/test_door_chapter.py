@@ -14,7 +14,7 @@ from experiments.doors import training as door_training
 from experiments.doors import ways as door_ways
 from experiments.doors.arms import arms_of, cell_of, mean_rate, rate, rate_by_friction, trainings
 from experiments.doors.success import door_seeds, evaluation_doors
-from experiments.doors.training import NETWORK, policy_path
+from experiments.doors.training import NETWORK, made_for, policy_path
 from experiments.policies import save_policy
 from ipo.worlds.door import DoorEnv
 
@@ -273,7 +273,7 @@ def test_every_frame_of_the_films_is_drawn_once(tmp_path, monkeypatch):
         cell = ARMS[arm]
         players = [NETWORK.start([np.random.default_rng(d)]) for d in range(num_players)]
         path = policy_path(tmp_path, cell.trained.label, 1, cell.updates)
-        save_policy(path, players, {"seed": 1, "choice": "best"})
+        save_policy(path, players, made_for(cell.trained, 1, cell.updates, "best"))
     films = {
         (arm, 0.1): door_figures.filmed(
             ARMS[arm], {"median": 1}, 0.1, door_seeds(1)[0], tmp_path, 200

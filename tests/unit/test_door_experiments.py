@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from experiments.doors import players as door_players
 from experiments.doors import training as door_training
 from experiments.doors.success import (
     EVALUATION_SEED,
@@ -17,6 +18,7 @@ from experiments.doors.training import (
     CELLS,
     NETWORK,
     last_info,
+    made_for,
     make_doors,
     policy_path,
     published_door,
@@ -33,7 +35,7 @@ def policies(tmp_path):
     for seed in (0, 1):
         players = [NETWORK.start([np.random.default_rng([seed, d])]) for d in range(2)]
         path = policy_path(tmp_path, "ipo", seed, 95, "last")
-        save_policy(path, players, {"seed": seed, "choice": "last"})
+        save_policy(path, players, made_for(CELLS["ipo"], seed, 95, "last"))
     return tmp_path
 
 
@@ -137,12 +139,38 @@ def test_an_evaluation_that_makes_no_sense_is_refused(change, error):
 def test_a_policy_of_the_wrong_size_or_run_is_refused(tmp_path, policies):
     small = DenseNetwork(15, 6, hidden=(8,)).start([np.random.default_rng(0)])
     path = policy_path(policies, "ipo", 0, 95, "last")
-    save_policy(path, [small], {"seed": 0, "choice": "last"})
+    save_policy(path, [small], made_for(CELLS["ipo"], 0, 95, "last"))
     with pytest.raises(ValueError, match=r"actor1.weight of player 0 has shape .*, needs"):
         evaluate(cell(), [0], policies)
     policy_path(policies, "ipo", 1, 95, "last").rename(path)
-    with pytest.raises(ValueError, match="was made for seed = 1, not 0"):
+    with pytest.raises(ValueError, match="made for something else: seed = 1, asked for 0"):
         evaluate(cell(), [0], policies)
     path.write_bytes(path.read_bytes()[:1000])
-    with pytest.raises(ValueError, match="cannot be read as a policy"):
+    with pytest.raises(ValueError, match="is cut short or changed"):
         evaluate(cell(), [0], policies)
+
+
+def test_a_policy_of_another_cell_is_refused(policies):
+    settings = published_door("ipo", learning_rate=1e-3)
+    other = door_training.Cell("ipo", settings)
+    with pytest.raises(ValueError, match=r"settings\.settings\.learning_rate = 0\.0005, asked for"):
+        evaluate(cell(trained=other), [0], policies)
+    gap = door_players.Cell(other, 95)
+    with pytest.raises(ValueError, match=r"was made with .*learning_rate=0\.0005.*, not with"):
+        door_players.load_players(policies, gap, 0)
+    slice_ = door_players.short(door_players.Cell(CELLS["ipo"], 95))
+    assert len(door_players.load_players(policies, slice_, 0)) == 2
+
+
+def test_a_training_whose_policies_have_no_place_does_not_begin(policies, tmp_path):
+    settings = published_door("ipo", learning_rate=1e-3)
+    with pytest.raises(ValueError, match=r"ipo_0_95_last.*: was made for something else"):
+        door_training.train_run(door_training.Cell("ipo", settings), [0], tmp_path, policies)
+
+
+@pytest.mark.parametrize("label", ["../ipo", "a/b", "/ipo"])
+def test_a_label_with_a_path_in_it_is_refused(tmp_path, label):
+    with pytest.raises(ValueError, match=r"label = .*: must be the name of a file"):
+        door_training.Cell(label, published_door("ipo"))
+    with pytest.raises(ValueError, match=r"label = .*: must be the name of a file"):
+        policy_path(tmp_path, label, 0, 95)

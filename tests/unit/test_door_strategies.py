@@ -7,7 +7,7 @@ import pytest
 
 from experiments.doors import success as door_experiments
 from experiments.doors.success import Cell, ScriptedCell, watch
-from experiments.doors.training import CELLS, NETWORK, last_info, policy_path
+from experiments.doors.training import CELLS, NETWORK, last_info, made_for, policy_path
 from experiments.policies import save_policy
 from ipo.worlds.door import DoorEnv, DoorParams
 from ipo.worlds.hooking import Hooking
@@ -91,7 +91,8 @@ def test_a_policy_that_is_watched_opens_the_doors_that_it_opens(tmp_path):
     """One door after the other, with contacts looked at, or all side by side."""
     players = [NETWORK.start([np.random.default_rng(0)])]
     cell = Cell(CELLS["ppo"], 95, frictions=(0.0,), num_doors=4)
-    save_policy(policy_path(tmp_path, "ppo", 0, 95), players, {"seed": 0, "choice": "best"})
+    made = made_for(CELLS["ppo"], 0, 95, "best")
+    save_policy(policy_path(tmp_path, "ppo", 0, 95), players, made)
     rows = watch(cell, [0], tmp_path)
     success = rows[rows["metric"] == "success"]["value"]
     assert list(success) == list(

@@ -12,6 +12,7 @@ import torch
 from minigrid.core.constants import OBJECT_TO_IDX
 
 from experiments import keys as experiment
+from experiments.experiment import rebuilt
 from experiments.keys import (
     EXPERIMENTS,
     Cell,
@@ -238,12 +239,32 @@ def test_rows_and_policies_of_a_cell(tmp_path, tables, method, options):
     (path,) = tmp_path.iterdir()
     assert path.name == f"{cell.name}.safetensors"
     task = Keys(tables, cell.color_encoding)
-    players, about = load_policy(path, task.network, {"cell": cell.name})
+    players, about = load_policy(path, task.network, {"cell": cell})
     assert about["seeds"] == [0, 1]
     returns = rows[rows["metric"] == "return_exact"].set_index(["domain", "run"])["value"]
     for (color, metric), values in exact(task, players).items():
         if metric == "return_exact":
             assert returns[color].tolist() == pytest.approx(values, rel=1e-9)
+
+
+def test_policies_of_other_settings_or_runs_are_not_overwritten(tmp_path, tables):
+    cell = tiny_cell("ppo")
+    run_cell(cell, [0], tables, tmp_path)
+    (path,) = tmp_path.iterdir()
+    before = path.read_bytes()
+    longer = replace(cell, settings=replace(cell.settings, learning_rate=0.1))
+    for other, seeds, differs in ((longer, [0], "learning_rate"), (cell, [0, 1], "seeds")):
+        with pytest.raises(ValueError, match=rf"was made for something else: .*{differs}"):
+            run_cell(other, seeds, tables, tmp_path)
+        assert path.read_bytes() == before
+    with pytest.raises(ValueError, match=r"was made for something else: cell\..*learning_rate"):
+        Keys(tables).saved(longer, tmp_path)
+
+
+@pytest.mark.parametrize("label", ["../ppo", "a/b", "/ppo", ""])
+def test_a_label_with_a_path_in_it_is_refused(label):
+    with pytest.raises(ValueError, match=r"label = .*: must be the name of a file"):
+        experiment.arm(label, "ppo")
 
 
 def test_later_runs_do_not_overwrite_the_first_policies(tmp_path, tables):
@@ -403,7 +424,8 @@ def shipped_policy(cell: tuple, network: GridNetwork) -> list:
     """Players of the first ten runs."""
     name = "_".join(map(str, cell[1:]))
     path = POLICIES / f"{name}.safetensors"
-    players, about = load_policy(path, network, {"cell": name})
+    players, about = load_policy(path, network)
+    assert rebuilt(Cell, about["cell"]).name == name
     assert about["seeds"] == list(range(10))
     assert {len(weight) for player in players for weight in player.values()} == {10}
     return players

@@ -262,13 +262,15 @@ def test_saved_policy_comes_back(tmp_path, num_players, num_channels):
         assert all(torch.equal(ours[name], theirs[name]) for name in theirs)
 
 
-def test_saving_again_replaces_the_file(tmp_path):
-    network = GridNetwork()
+def test_saving_again_replaces_the_policy_of_the_same_cell_alone(tmp_path):
+    network, path = GridNetwork(), tmp_path / "policy.safetensors"
     first, second = network.start(generators(0)), network.start(generators(1))
-    save_policy(tmp_path / "policy.safetensors", [first, second], {"cell": "a"})
-    save_policy(tmp_path / "policy.safetensors", [second], {"cell": "b"})
-    (loaded,), about = load_policy(tmp_path / "policy.safetensors", network)
-    assert about == {"cell": "b"}
+    save_policy(path, [first, second], {"cell": "a"}, {"minutes": 1})
+    save_policy(path, [second], {"cell": "a"}, {"minutes": 2})
+    with pytest.raises(ValueError, match="was made for something else: cell = 'a', asked for 'b'"):
+        save_policy(path, [first], {"cell": "b"})
+    (loaded,), about = load_policy(path, network)
+    assert about == {"cell": "a", "minutes": 2}
     assert torch.equal(loaded["conv1.weight"], second["conv1.weight"])
 
 

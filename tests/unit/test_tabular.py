@@ -1,6 +1,9 @@
 """The tabulated task against MiniGrid itself; exact returns against slow sums and sampling."""
 
 import copy
+import errno
+import io
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 
@@ -16,7 +19,8 @@ from minigrid.core.constants import COLOR_TO_IDX, OBJECT_TO_IDX
 from minigrid.envs import DynamicObstaclesEnv
 
 from experiments import tabulated
-from experiments.tabulated import load_or_tabulate
+from experiments.sealed import write_sealed
+from experiments.tabulated import TableWarning, load_or_tabulate
 from ipo.worlds.colored_keys import COLORS, ColoredKeysEnv
 from ipo.worlds.tabular import (
     NotTabularError,
@@ -422,27 +426,57 @@ def test_other_options_or_minigrid_give_another_table(tmp_path, calls, monkeypat
     load_or_tabulate(ColoredKeysEnv, tmp_path, color="blue", size=5)
     monkeypatch.setattr(tabulated, "version", lambda package: "3.2.99")
     load_or_tabulate(ColoredKeysEnv, tmp_path, color="red")
-    assert len(calls) == 4 and len(list(tmp_path.glob("*.npz"))) == 4
+    assert len(calls) == 4 and len(list(tmp_path.glob("*.table"))) == 4
 
 
 def test_table_that_the_environment_contradicts_is_made_again(tmp_path, calls, keys):
     load_or_tabulate(ColoredKeysEnv, tmp_path, color="red")
-    (path,) = tmp_path.glob("*.npz")
+    (path,) = tmp_path.glob("*.table")
     wrong = replace(keys["red"], goal_reward=keys["red"].goal_reward - 0.1)
     for other in (wrong, keys["blue"]):
         assert not tabulated.agrees(other, ColoredKeysEnv(color="red"))
-        np.savez_compressed(path, **vars(other))
+        write_sealed(path, archive(**vars(other)))
         assert_same(load_or_tabulate(ColoredKeysEnv, tmp_path, color="red"), keys["red"])
     assert len(calls) == 3
 
 
-def test_table_of_a_killed_program_is_made_again(tmp_path, calls):
-    whole = load_or_tabulate(ColoredKeysEnv, tmp_path)
-    (path,) = tmp_path.glob("*.npz")
-    path.rename(path.with_suffix(".partial.npz"))
-    path.with_suffix(".partial.npz").write_bytes(b"half")
-    assert_same(load_or_tabulate(ColoredKeysEnv, tmp_path), whole)
+def archive(**arrays) -> bytes:
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **arrays)
+    return buffer.getvalue()
+
+
+DAMAGE = {
+    "truncated": lambda path: path.write_bytes(path.read_bytes()[:-9]),
+    "changed": lambda path: path.write_bytes(path.read_bytes()[:-9] + bytes(9)),
+    "empty": lambda path: path.write_bytes(b""),
+    "without a seal": lambda path: path.write_bytes(archive(images=np.zeros(3))),
+    "other keys": lambda path: write_sealed(path, archive(images=np.zeros(3))),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGE.values(), ids=DAMAGE.keys())
+def test_damaged_table_is_named_and_made_again(tmp_path, calls, keys, damage):
+    load_or_tabulate(ColoredKeysEnv, tmp_path, color="red")
+    (path,) = tmp_path.glob("*.table")
+    damage(path)
+    with pytest.warns(TableWarning, match=rf"{path}: is made anew: "):
+        assert_same(load_or_tabulate(ColoredKeysEnv, tmp_path, color="red"), keys["red"])
+    assert_same(load_or_tabulate(ColoredKeysEnv, tmp_path, color="red"), keys["red"])
     assert len(calls) == 2
+
+
+def test_table_that_cannot_be_kept_is_made_each_time(tmp_path, calls, keys, monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    (tmp_path / "file").write_text("not a folder")
+    monkeypatch.setattr(os, "fsync", full)
+    for folder in (tmp_path / "file" / "tables", tmp_path / "full"):
+        with pytest.warns(TableWarning, match=rf"{folder}.*: cannot be written \(N"):
+            assert_same(load_or_tabulate(ColoredKeysEnv, folder, color="red"), keys["red"])
+    assert len(calls) == 2
+    assert [path.suffix for path in (tmp_path / "full").iterdir()] in ([], [".lock"])
 
 
 # ------------------------------------------------------------------------ exact returns
