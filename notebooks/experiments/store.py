@@ -30,6 +30,7 @@ from tqdm import tqdm
 from experiments import origin
 from experiments.experiment import Cell, Experiment, rebuilt
 from experiments.files import replace_text
+from experiments.workers import parallel
 from ipo.checks import check_counts
 
 KEYS = {"columns", "cell", "run", "options", "seeds", "reads", "num_rows", "sha256"}  # of a batch
@@ -118,7 +119,7 @@ class Store:
         if missing:
             self._check_writable()
             jobs = (joblib.delayed(timed)(experiment.run, cell, runs) for cell, runs in missing)
-            work = joblib.Parallel(n_jobs=num_workers, return_as="generator_unordered")(jobs)
+            work = parallel(num_workers, return_as="generator_unordered")(jobs)
             for cell, new_rows, cost in tqdm(
                 work, desc=self.name, total=len(missing), unit="batch"
             ):
