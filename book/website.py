@@ -11,6 +11,7 @@ from pathlib import Path
 import nbformat
 
 import claims
+import licences
 import provenance
 from chapters import Notebook, tree_hash
 from experiments.files import replace_text
@@ -37,19 +38,20 @@ def build_site(root: Path, build: Path, notebooks: list[Notebook], profile: str)
 def stage(root: Path, source: Path, notebooks: list[Notebook], profile: str) -> None:
     """Put all that enters the site into one folder: prose, executed notebooks, generated pages."""
     shutil.rmtree(source, ignore_errors=True)
-    ignored = shutil.ignore_patterns("_build", "_executed", "__pycache__")
-    shutil.copytree(root / "book", source, ignore=ignored)
-    for script in source.glob("*.py"):
-        script.unlink()
+    others = shutil.ignore_patterns("_build", "_executed", "__pycache__", "*.py", "locks")
+    shutil.copytree(root / "book", source, ignore=others)
     for name in ("_config.yml", "_toc.yml", "environment.txt"):
         shutil.copy(root / name, source)
     # What pages show of the code is included from these files (literalinclude), not copied.
-    shutil.copytree(root / "ipo", source / "_code" / "ipo", ignore=ignored)
+    shutil.copytree(
+        root / "ipo", source / "_code" / "ipo", ignore=shutil.ignore_patterns("__pycache__")
+    )
     for notebook in notebooks:
         nbformat.write(notebook.read_executed(), source / f"{notebook.name}.ipynb")
     (source / "run_times.md").write_text(run_times_page(notebooks, profile), encoding="utf-8")
     claims.write_fragments(source)
     provenance.write_fragment(source)
+    licences.write_fragment(source)
 
 
 def run_jupyter_book(source: Path, output: Path) -> Path:
