@@ -6,8 +6,11 @@ STARTED := $(shell date +%s)
 IN_VENV := .venv/bin/python
 SETUP_SECONDS = --setup-seconds $$(( $$(date +%s) - $(STARTED) ))
 
+LOCK := .venv/bin/uv pip compile --quiet --universal --python-version 3.11.5 --generate-hashes \
+	--no-annotate --custom-compile-command "make lock"
+
 .DEFAULT_GOAL := help
-.PHONY: help setup book test verify confirm reproduce claims serve lab lint format clean
+.PHONY: help setup book test verify confirm reproduce claims serve lab lint format lock newest clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## /{printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -48,6 +51,23 @@ lint: setup ## ruff's checks and format, and the types of ipo/, without changing
 
 format: setup ## ruff's format and safe repairs
 	@$(IN_VENV) -m ruff check --fix && $(IN_VENV) -m ruff format
+
+lock: setup ## the hashes of the pinned packages anew, after a change of environment.txt
+	@sed '/^torch==/d' environment.txt | $(LOCK) - --output-file book/locks/packages.txt >/dev/null
+	@grep '^torch==' environment.txt \
+		| $(LOCK) --constraint environment.txt - --output-file book/locks/torch.txt >/dev/null
+	@grep '^uv==' environment.txt | $(LOCK) - --output-file book/locks/uv.txt >/dev/null
+
+# All but jupyter-book, whose 2.x is another program.
+newest: ## the tests with the newest versions of all direct dependencies, in .newest
+	@$(PYTHON) -m venv --clear .newest
+	@sed '/^# What the packages above need/,$$d; /^jupyter-book==/!s/==[^ ]*//' environment.txt \
+		| .newest/bin/python -m pip install --quiet --requirement /dev/stdin
+	@.newest/bin/python -m pip install --quiet --no-deps --no-build-isolation \
+		--editable . --editable notebooks
+	@.newest/bin/python -m pip freeze
+	@.newest/bin/python -m experiments.witness verify
+	@.newest/bin/python -m pytest
 
 clean: ## remove what was built; the environment and data/ stay
 	@rm -rf book/_build book/_executed .pytest_cache .ruff_cache .mypy_cache .hypothesis

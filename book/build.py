@@ -4,20 +4,29 @@ from __future__ import annotations
 
 import argparse
 import sys
+import tempfile
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import joblib
+from filelock import FileLock, Timeout
 
-from execute import BuildError, execute, load_notebooks, shown
+from execute import execute
+from experiments.orphans import interrupt_on_sigterm
+from messages import BuildError, shown
+from profiles import load_notebooks
 from website import build_site
 
 ROOT = Path(__file__).resolve().parents[1]
+UNFINISHED = ("_executed/*/*.running.*", "_executed/*/*.tmp", "_build/*.tmp")
 
 
 def main(arguments: list[str] | None = None, root: Path = ROOT) -> int:
     """Build the book of the project in `root`; returns the exit status."""
     options = parse(arguments, root)
+    interrupt_on_sigterm()
     try:
         return build(root, options)
     except BuildError as error:
@@ -45,15 +54,70 @@ def parse(arguments: list[str] | None, root: Path) -> argparse.Namespace:
 
 def build(root: Path, options: argparse.Namespace) -> int:
     """All steps, and how long each took."""
-    steps = []
-    if options.setup_seconds is not None:
-        steps.append(("set-up", f"{options.setup_seconds:.1f} s"))
     output = options.output.resolve()
     executed = output / "_executed" / options.profile
     notebooks = load_notebooks(root, options.profile, executed)
     if options.chapter:
         notebooks = only(options.chapter, notebooks)
+    make_folders(output / "_build", executed)
+    with alone(output):
+        remove_unfinished(output)
+        return execute_and_build(root, output, notebooks, options)
 
+
+def only(chapter: str, notebooks: list) -> list:
+    """The one notebook of that name."""
+    chosen = [notebook for notebook in notebooks if notebook.name == chapter]
+    if not chosen:
+        names = ", ".join(notebook.name for notebook in notebooks)
+        raise BuildError(f"There is no chapter {chapter!r}; the chapters are {names}")
+    return chosen
+
+
+def make_folders(*folders: Path) -> None:
+    try:
+        for folder in folders:
+            folder.mkdir(parents=True, exist_ok=True)
+            tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        raise BuildError(
+            f"{shown(folder)} cannot be written: {error.strerror}. A build writes notebooks and "
+            "site there; to have them elsewhere, name a folder: book/build.py --output FOLDER"
+        ) from error
+
+
+@contextmanager
+def alone(output: Path) -> Iterator[None]:
+    """One build at a time writes to a folder; the next one waits until it has ended."""
+    lock = FileLock(output / "_build" / "lock")
+    try:
+        lock.acquire(blocking=False)
+    except Timeout:
+        print(
+            f"Waiting for another build, which writes to {shown(output)}",
+            file=sys.stderr,
+            flush=True,
+        )
+        lock.acquire()
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+def remove_unfinished(output: Path) -> None:
+    """What a build leaves that was killed."""
+    for pattern in UNFINISHED:
+        for path in output.glob(pattern):
+            path.unlink()
+
+
+def execute_and_build(
+    root: Path, output: Path, notebooks: list, options: argparse.Namespace
+) -> int:
+    steps = []
+    if options.setup_seconds is not None:
+        steps.append(("set-up", f"{options.setup_seconds:.1f} s"))
     changed = [notebook for notebook in notebooks if not notebook.is_current()]
     failures = execute(changed, options.jobs)
     if failures:
@@ -76,15 +140,6 @@ def build(root: Path, options: argparse.Namespace) -> int:
         print(f"{name:<{width}}  {took:>9}")
     print(result)
     return 0
-
-
-def only(chapter: str, notebooks: list) -> list:
-    """The one notebook of that name."""
-    chosen = [notebook for notebook in notebooks if notebook.name == chapter]
-    if not chosen:
-        names = ", ".join(notebook.name for notebook in notebooks)
-        raise BuildError(f"There is no chapter {chapter!r}; the chapters are {names}")
-    return chosen
 
 
 if __name__ == "__main__":

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 
 import nbformat
 
 import claims
+import licences
 import provenance
-from execute import BuildError, Notebook, for_terminal, replace_text, tree_hash
+from chapters import Notebook, tree_hash
+from experiments.files import replace_text
+from experiments.orphans import python
+from messages import BuildError, for_terminal
 
 NUM_SLOWEST_CELLS = 8
 JUPYTER_BOOK = "from jupyter_book.cli.main import main; main()"
@@ -23,12 +27,10 @@ def build_site(root: Path, build: Path, notebooks: list[Notebook], profile: str)
     source, html, built_from = build / "source", build / "html", build / "html.sources"
     stage(root, source, notebooks, profile)
     sources = tree_hash(source)
-    if html.exists() and built_from.exists() and built_from.read_text() == sources:
+    if built_from.exists() and built_from.read_text() == f"{sources} {tree_hash(html)}\n":
         return False
-    fresh = run_jupyter_book(source, build / "new")
-    built_from.unlink(missing_ok=True)
-    replace_folder(html, fresh)
-    replace_text(built_from, sources)
+    replace_folder(html, run_jupyter_book(source, build / "new"))
+    replace_text(built_from, f"{sources} {tree_hash(html)}\n")
     shutil.rmtree(build / "new")
     return True
 
@@ -36,28 +38,28 @@ def build_site(root: Path, build: Path, notebooks: list[Notebook], profile: str)
 def stage(root: Path, source: Path, notebooks: list[Notebook], profile: str) -> None:
     """Put all that enters the site into one folder: prose, executed notebooks, generated pages."""
     shutil.rmtree(source, ignore_errors=True)
-    ignored = shutil.ignore_patterns("_build", "_executed", "__pycache__")
-    shutil.copytree(root / "book", source, ignore=ignored)
-    for script in source.glob("*.py"):
-        script.unlink()
+    others = shutil.ignore_patterns("_build", "_executed", "__pycache__", "*.py", "locks")
+    shutil.copytree(root / "book", source, ignore=others)
     for name in ("_config.yml", "_toc.yml", "environment.txt"):
         shutil.copy(root / name, source)
     # What pages show of the code is included from these files (literalinclude), not copied.
-    shutil.copytree(root / "ipo", source / "_code" / "ipo", ignore=ignored)
+    shutil.copytree(
+        root / "ipo", source / "_code" / "ipo", ignore=shutil.ignore_patterns("__pycache__")
+    )
     for notebook in notebooks:
         nbformat.write(notebook.read_executed(), source / f"{notebook.name}.ipynb")
     (source / "run_times.md").write_text(run_times_page(notebooks, profile), encoding="utf-8")
     claims.write_fragments(source)
     provenance.write_fragment(source)
+    licences.write_fragment(source)
 
 
 def run_jupyter_book(source: Path, output: Path) -> Path:
     """Build the staged sources; any warning is an error. Returns the folder of the pages."""
     shutil.rmtree(output, ignore_errors=True)
-    command = [sys.executable, "-c", JUPYTER_BOOK, "build", source, "--path-output", output]
     strict = ["--nitpick", "--warningiserror", "--keep-going", "-q"]
     done = subprocess.run(
-        [*command, *strict],
+        python(JUPYTER_BOOK, "build", str(source), "--path-output", str(output), *strict),
         cwd=source,
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
@@ -73,13 +75,20 @@ def run_jupyter_book(source: Path, output: Path) -> Path:
 
 
 def replace_folder(old: Path, new: Path) -> None:
-    """Put a complete folder in the place of another; both exist until the names are swapped."""
-    aside = old.with_name(f"{old.name}.old")
-    shutil.rmtree(aside, ignore_errors=True)
-    if old.exists():
+    """Put a complete folder in the place of another, which goes."""
+    if not old.exists():
+        new.rename(old)
+    elif not exchanged(old, new):  # between these two names neither is there, for microseconds
+        aside = new.with_name(f"{new.name}.old")
         old.rename(aside)
-    new.rename(old)
-    shutil.rmtree(aside, ignore_errors=True)
+        new.rename(old)
+
+
+def exchanged(one: Path, other: Path) -> bool:
+    """Swap two names in one step; only Linux can, and not on every file system."""
+    swap = getattr(ctypes.CDLL(None), "renameat2", None)
+    here, exchange = -100, 2  # AT_FDCWD, RENAME_EXCHANGE
+    return swap is not None and swap(here, bytes(one), here, bytes(other), exchange) == 0
 
 
 def run_times_page(notebooks: list[Notebook], profile: str) -> str:

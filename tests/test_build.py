@@ -14,7 +14,8 @@ import claims
 import provenance
 import sources
 from build import main
-from execute import load_notebooks, tree_hash
+from chapters import tree_hash
+from profiles import load_notebooks
 
 PROFILES = {
     "class": "plain: {num_runs: 3}\n",

@@ -33,9 +33,11 @@ from tqdm import tqdm
 
 from experiments import origin
 from experiments.files import replace_text
+from experiments.orphans import interrupt_on_sigterm
 from experiments.registry import DATA, chosen
 from experiments.store import Store, select
 from experiments.witness import Slice, side_by_side, within
+from experiments.workers import parallel
 
 CONFIRMED = DATA / "confirmed.json"
 CHAOTIC = (
@@ -72,7 +74,7 @@ def confirm(names: Sequence[str] = (), since: str | None = None) -> list[str]:
     print(f"{len(waiting)} cells, {total:.0f} CPU-minutes by their records", flush=True)
     with TemporaryDirectory() as scratch:
         jobs = (joblib.delayed(_outcome)(part, Path(scratch)) for part in waiting)
-        work = joblib.Parallel(n_jobs=-1, return_as="generator_unordered")(jobs)
+        work = parallel(-1, return_as="generator_unordered")(jobs)
         for cell, outcome in tqdm(work, total=len(waiting), unit="cell"):
             _save(cell, outcome)
     record = confirmed()
@@ -147,6 +149,7 @@ def main() -> None:
     parser.add_argument("names", nargs="*", help="chapters, or experiments such as lqr/tables")
     parser.add_argument("--since", help="what was confirmed at this commit, or later, counts")
     options = parser.parse_args()
+    interrupt_on_sigterm()
     if different := confirm(options.names, options.since):
         sys.exit("These cells differ from the shipped rows:\n" + "\n".join(different))
 

@@ -34,6 +34,7 @@ from experiments.experiment import Cell, Experiment, difference, filled, plain
 from experiments.files import check_file_name, replace_text
 from experiments.rows import ResultsError, check_rows, types_of
 from experiments.sealed import digest_of
+from experiments.workers import parallel
 from ipo.checks import check_counts
 
 KEYS = {"columns", "cell", "run", "options", "seeds", "reads", "num_rows", "sha256"}  # of a batch
@@ -125,7 +126,7 @@ class Store:
             self._check_storable([cell for cell, _ in missing])
             self._check_writable()
             jobs = (joblib.delayed(timed)(experiment.run, cell, runs) for cell, runs in missing)
-            work = joblib.Parallel(n_jobs=num_workers, return_as="generator_unordered")(jobs)
+            work = parallel(num_workers, return_as="generator_unordered")(jobs)
             for cell, new_rows, cost in tqdm(
                 work, desc=self.name, total=len(missing), unit="batch"
             ):

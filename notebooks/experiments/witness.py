@@ -26,8 +26,10 @@ from tqdm import tqdm
 
 from experiments import own_domains
 from experiments.experiment import Cell, rebuilt
+from experiments.orphans import interrupt_on_sigterm
 from experiments.registry import CHAPTERS, DATA, again, chosen
 from experiments.store import Batch, Store, timed
+from experiments.workers import parallel
 
 WITNESS = DATA / "witness"
 
@@ -83,7 +85,7 @@ def verify(names: Sequence[str] = (), num_workers: int = -1) -> list[str]:
     ]
     with TemporaryDirectory() as scratch:
         jobs = (joblib.delayed(_attempt)(part, Path(scratch)) for part in recorded)
-        work = joblib.Parallel(n_jobs=num_workers, return_as="generator")(jobs)
+        work = parallel(num_workers, return_as="generator")(jobs)
         for part, rows in tqdm(zip(recorded, work, strict=True), total=len(recorded), unit="slice"):
             problems += differences(part, rows)
     return problems
@@ -165,6 +167,7 @@ def main() -> None:
     parser.add_argument("action", choices=("verify", "record"))
     parser.add_argument("names", nargs="*", help="chapters, or experiments such as lqr/tables")
     options = parser.parse_args()
+    interrupt_on_sigterm()
     if options.action == "record":
         record(options.names)
         return

@@ -26,6 +26,7 @@ from experiments.doors.arms import (
 from experiments.doors.authors_policies import authors_policies
 from experiments.doors.success import Cell
 from experiments.doors.training import CURVE_FRICTION, EVALUATION_SEED, TRAIN_FRICTIONS, last_info
+from experiments.workers import parallel
 from ipo.stats import paired_difference, probability_of_improvement
 
 PAIRS = {
@@ -99,7 +100,7 @@ def table_of_authors(
     """Percent of our doors that the authors' own policies open."""
     saved = authors_policies(repository)
     jobs = [(m, str(f), players) for m in saved for f in tested for players in saved[m]]
-    found = joblib.Parallel(n_jobs=num_workers)(
+    found = parallel(num_workers)(
         joblib.delayed(last_info)(players, float(f), num_doors, EVALUATION_SEED)
         for _, f, players in jobs
     )

@@ -1,0 +1,75 @@
+"""The table of licences: of every pinned package, and of what pages bring along."""
+
+from __future__ import annotations
+
+import re
+from importlib.metadata import files, metadata
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+PIN = re.compile(r"([\w.-]+)==([\w.+]+)")
+# Of what pages bring along that neither we nor those packages wrote: where it says so.
+NOTICES = (
+    ("pydata-sphinx-theme", "bootstrap.js.LICENSE.txt"),
+    ("pydata-sphinx-theme", "fontawesome.js.LICENSE.txt"),
+    ("sphinx-copybutton", "clipboard.min.js"),
+)
+
+
+def write_fragment(folder: Path) -> None:
+    """Writes ``_generated/licences.md`` under ``folder``."""
+    target = Path(folder) / "_generated"
+    target.mkdir(parents=True, exist_ok=True)
+    (target / "licences.md").write_text(overview(), encoding="utf-8")
+
+
+def overview() -> str:
+    lines = ["| In the pages | Comes with | Licence |", "|:--|:--|:--|", mathjax()]
+    lines += [notice(package, name) for package, name in NOTICES]
+    lines += ["", "| Package | Version | Licence |", "|:--|:--|:--|"]
+    lines += [f"| {name} | {version} | {licence(name)} |" for name, version in pinned().items()]
+    return "\n".join(lines) + "\n"
+
+
+def mathjax() -> str:
+    folder = ROOT / "book" / "extra" / "mathjax"
+    title = (folder / "VERSION.md").read_text(encoding="utf-8").splitlines()[0]
+    terms = (folder / "LICENSE").read_text(encoding="utf-8").split("\n\n")[0]
+    return f"| {title.lstrip('# ')} | `book/extra/mathjax` | {' '.join(terms.split())} |"
+
+
+def notice(package: str, name: str) -> str:
+    """The first and the decisive line of the comment that a file begins with."""
+    [path] = [path for path in files(package) or [] if path.name == name]
+    comment = path.read_text(encoding="utf-8").split("*/")[0]
+    lines = [line.strip(" */!") for line in comment.splitlines()]
+    title = next(line for line in lines if line)
+    terms = next(line for line in lines if "Licen" in line)
+    return f"| {title} | {package} | {terms} |"
+
+
+def pinned() -> dict[str, str]:
+    """The packages of ``environment.txt`` and their versions."""
+    text = (ROOT / "environment.txt").read_text(encoding="utf-8")
+    found = [match.groups() for line in text.splitlines() if (match := PIN.match(line))]
+    return dict(sorted(found, key=lambda pin: pin[0].lower()))
+
+
+def licence(name: str) -> str:
+    """What an installed package says of itself, in the newest of three ways that it may use.
+
+    Raises:
+        ValueError: a package that names none.
+    """
+    about = metadata(name)
+    classifiers = [text.split(" :: ") for text in about.get_all("Classifier") or []]
+    free_text = (about["License"] or "").strip().splitlines()
+    said = [
+        about["License-Expression"],
+        ", ".join(parts[-1] for parts in classifiers if parts[0] == "License"),
+        free_text[0] if free_text else None,
+    ]
+    named = [text for text in said if text and text != "UNKNOWN"]
+    if not named:
+        raise ValueError(f"package = {name!r}: must name its licence in its metadata")
+    return named[0]
