@@ -1,6 +1,6 @@
 """One full batch of every cell again: before a release, or after a change on purpose.
 
-    python -m experiments.confirm [--since COMMIT] [lqr keys/main ...]
+    python -m experiments.confirm [--since COMMIT] [--scheduler tcp://...] [lqr keys/main ...]
 
 For each cell the first recorded batch is computed again and held beside the shipped rows:
 
@@ -21,11 +21,11 @@ import datetime
 import json
 import sys
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import joblib
 import pandas as pd
 import scipy.stats
 from filelock import FileLock
@@ -36,6 +36,7 @@ from experiments.files import replace_text
 from experiments.registry import DATA, chosen
 from experiments.store import Store, select
 from experiments.witness import Slice, side_by_side, within
+from experiments.work import finished
 
 CONFIRMED = DATA / "confirmed.json"
 CHAOTIC = (
@@ -63,16 +64,18 @@ def title(part: Slice) -> str:
     return " ".join([f"{part.chapter}/{part.name}", *map(str, part.batch["columns"].values())])
 
 
-def confirm(names: Sequence[str] = (), since: str | None = None) -> list[str]:
-    """Confirm what is not, on all cores; returns the titles of the cells that differ."""
+def confirm(
+    names: Sequence[str] = (), since: str | None = None, scheduler: str | None = None
+) -> list[str]:
+    """Confirm what is not, on all cores or by a dask scheduler; returns the cells that differ."""
     done = confirmed()
     waiting = [part for part in full_batches(names) if not _is_done(done, title(part), since)]
     waiting.sort(key=lambda part: -part.batch["cpu_seconds"])  # long ones first: no idle core
     total = sum(part.batch["cpu_seconds"] for part in waiting) / 60
     print(f"{len(waiting)} cells, {total:.0f} CPU-minutes by their records", flush=True)
     with TemporaryDirectory() as scratch:
-        jobs = (joblib.delayed(_outcome)(part, Path(scratch)) for part in waiting)
-        work = joblib.Parallel(n_jobs=-1, return_as="generator_unordered")(jobs)
+        jobs = [partial(_outcome, part, Path(scratch)) for part in waiting]
+        work = finished(jobs, -1, scheduler)
         for cell, outcome in tqdm(work, total=len(waiting), unit="cell"):
             _save(cell, outcome)
     record = confirmed()
@@ -146,8 +149,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("names", nargs="*", help="chapters, or experiments such as lqr/tables")
     parser.add_argument("--since", help="what was confirmed at this commit, or later, counts")
+    parser.add_argument("--scheduler", help="address of a dask scheduler whose workers compute")
     options = parser.parse_args()
-    if different := confirm(options.names, options.since):
+    if different := confirm(options.names, options.since, options.scheduler):
         sys.exit("These cells differ from the shipped rows:\n" + "\n".join(different))
 
 

@@ -19,10 +19,10 @@ import tempfile
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-import joblib
 import pandas as pd
 from filelock import FileLock
 from tqdm import tqdm
@@ -30,6 +30,7 @@ from tqdm import tqdm
 from experiments import origin
 from experiments.experiment import Cell, Experiment, rebuilt
 from experiments.files import replace_text
+from experiments.work import finished
 from ipo.checks import check_counts
 
 KEYS = {"columns", "cell", "run", "options", "seeds", "reads", "num_rows", "sha256"}  # of a batch
@@ -88,6 +89,7 @@ class Store:
         cells: Sequence[Cell],
         seeds: Sequence[int],
         num_workers: int | None = None,
+        scheduler: str | None = None,
     ) -> pd.DataFrame:
         """The rows of ``cells`` x ``seeds``: loaded where they exist, computed where they do not.
 
@@ -95,7 +97,7 @@ class Store:
             experiment: how rows are made.
             cells: the configurations; their ``columns`` are the first columns of their rows.
             seeds: the runs of every cell.
-            num_workers: processes that compute; ``None`` leaves it to ``joblib.parallel_config``.
+            num_workers, scheduler: who computes; see :func:`experiments.work.finished`.
 
         Every finished batch is saved at once: after an interruption the next call goes on with
         what is missing and ends with the same rows.
@@ -103,29 +105,42 @@ class Store:
         Raises:
             ResultsError: files that are damaged, or a folder that cannot be written.
             OriginError: rows of another cell, option, run function or input than asked for.
+            WorkError: a scheduler that cannot be reached or is lost.
         """
         check_counts("seeds", seeds, minimum=0)
         rows, batches = self._read()
-        for cell in cells:
-            for batch in batches:
-                if batch["columns"] == cell.columns:
-                    self._check_origin(experiment, cell, seeds, batch)
         size = experiment.runs_at_once or len(seeds)
-        lacking = [(cell, _lacking(cell, seeds, batches)) for cell in cells]
+        lacking = [(cell, self._missing(experiment, cell, seeds, batches)) for cell in cells]
         missing = [
             (cell, runs[i : i + size]) for cell, runs in lacking for i in range(0, len(runs), size)
         ]
         if missing:
-            self._check_writable()
-            jobs = (joblib.delayed(timed)(experiment.run, cell, runs) for cell, runs in missing)
-            work = joblib.Parallel(n_jobs=num_workers, return_as="generator_unordered")(jobs)
-            for cell, new_rows, cost in tqdm(
+            self.check_writable()
+            jobs = [partial(timed, experiment.run, cell, runs) for cell, runs in missing]
+            work = finished(jobs, num_workers, scheduler)
+            for cell, new_rows, made in tqdm(
                 work, desc=self.name, total=len(missing), unit="batch"
             ):
-                self._add(experiment, cell, new_rows, cost)
+                self.add(experiment, cell, new_rows, made)
             rows, _ = self._read()
         wanted = rows[rows["run"].isin(seeds)]
         return pd.concat([select(wanted, cell.columns) for cell in cells], ignore_index=True)
+
+    def lacking(self, experiment: Experiment, cell: Cell, seeds: Sequence[int]) -> list[int]:
+        """The runs of a cell that are not there yet.
+
+        Raises:
+            ResultsError, OriginError: as in :meth:`fill`; rows are not looked at.
+        """
+        return self._missing(experiment, cell, seeds, self.batches())
+
+    def _missing(
+        self, experiment: Experiment, cell: Cell, seeds: Sequence[int], batches: list[Batch]
+    ) -> list[int]:
+        for batch in batches:
+            if batch["columns"] == cell.columns:
+                self._check_origin(experiment, cell, seeds, batch)
+        return _lacking(cell, seeds, batches)
 
     def _read(self) -> tuple[pd.DataFrame, list[Batch]]:
         """Rows and batches, every batch checked against its rows."""
@@ -194,8 +209,8 @@ class Store:
                 f"{self.csv.name} and {self.json.name} away, or name another folder for the results"
             )
 
-    def _add(
-        self, experiment: Experiment, cell: Cell, rows: pd.DataFrame, cost: dict[str, float]
+    def add(
+        self, experiment: Experiment, cell: Cell, rows: pd.DataFrame, made: dict[str, Any]
     ) -> None:
         """Add the rows of one cell. Two programs may fill the same files at the same time.
 
@@ -213,11 +228,8 @@ class Store:
                 "seeds": seeds,
                 "num_rows": len(rows),
                 "sha256": digest(rows),
-                "versions": origin.versions(),
-                "machine": origin.machine(),
-                "commit": origin.commit(),
                 "finished": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-                **cost,
+                **made,
             }
             batches = sorted(
                 [*batches, batch], key=lambda b: json.dumps([b["columns"], b["seeds"]])
@@ -236,7 +248,7 @@ class Store:
         record = {"types": types, "batches": batches}
         replace_text(self.json, json.dumps(record, indent=1) + "\n")
 
-    def _check_writable(self) -> None:
+    def check_writable(self) -> None:
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             tempfile.TemporaryFile(dir=self.folder).close()
@@ -245,15 +257,18 @@ class Store:
 
 
 def timed(run: Callable, cell: Cell, seeds: list[int]) -> tuple[Cell, pd.DataFrame, dict]:
-    """The rows of a run, values to nine digits, and what they cost."""
+    """The rows of a run, values to nine digits; where they were made, and what they cost."""
     wall, cpu = time.perf_counter(), time.process_time()
     rows = run(cell, seeds)
-    cost = {
+    made = {
         "cpu_seconds": round(time.process_time() - cpu, 2),
         "wall_seconds": round(time.perf_counter() - wall, 2),
+        "versions": origin.versions(),
+        "machine": origin.machine(),
+        "commit": origin.commit(),
     }
     rows["value"] = [float(f"{value:.9g}") for value in rows["value"]]
-    return cell, rows, cost
+    return cell, rows, made
 
 
 def asked(experiment: Experiment, cell: Cell, seeds: Sequence[int]) -> dict[str, Any]:
