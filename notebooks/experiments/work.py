@@ -47,12 +47,15 @@ def finished(
         yield from run(joblib.delayed(job)() for job in jobs)
 
 
-def num_at_once(scheduler: str | None = None) -> int:
-    """How many jobs are run at the same time on all cores, or by the scheduler's workers now."""
+def num_at_once(num_workers: int, scheduler: str | None = None) -> int:
+    """How many jobs are run at the same time: by so many processes, or by a scheduler's workers.
+
+    Workers may come later, as those of a queue do; there will be at least one.
+    """
     if scheduler := scheduler or os.environ.get(ADDRESS):
         with _client(scheduler) as client:
-            return len(client.nthreads())
-    return joblib.cpu_count()
+            return max(1, len(client.nthreads()))
+    return joblib.effective_n_jobs(num_workers)
 
 
 def _on_cluster(jobs: Sequence[Job], scheduler: str) -> Iterator[Any]:

@@ -82,7 +82,7 @@ def test_rows_are_those_of_processes(address, tmp_path):
     here(tmp_path / "joblib")
     here(tmp_path / "dask", scheduler=address)
     assert written(tmp_path / "dask") == written(tmp_path / "joblib")
-    assert num_at_once(address) == 2
+    assert num_at_once(1, address) == 2
 
 
 def test_batch_of_a_killed_worker_is_computed_again(address, tmp_path):
@@ -120,7 +120,9 @@ def test_nothing_is_lost_with_the_scheduler(cluster, tmp_path):
     folder = tmp_path / "lost"
     folder.mkdir()
     (folder / "fast_2").write_text(f"{process.pid} 2")
-    with pytest.raises(WorkError, match="was lost. What was finished is saved, and the same call"):
+    with pytest.raises(
+        WorkError, match=r"was lost\. What was finished is saved, and the same call"
+    ):
         here(folder, scheduler=address)
     assert [batch["columns"] for batch in Store(folder, "toy").batches()] == [
         cell.columns for cell in (CELLS[1], CELLS[0])
