@@ -4,6 +4,7 @@ PYTHON ?= python3
 PROFILE ?= class
 STARTED := $(shell date +%s)
 IN_VENV := .venv/bin/python
+SCHEDULED = $(if $(SCHEDULER),--scheduler $(SCHEDULER))
 SETUP_SECONDS = --setup-seconds $$(( $$(date +%s) - $(STARTED) ))
 
 LOCK := .venv/bin/uv pip compile --quiet --universal --python-version 3.11.5 --generate-hashes \
@@ -30,12 +31,12 @@ verify: setup ## whether today's code still gives the results: a slice of every 
 	@$(IN_VENV) -m experiments.witness verify $(CHAPTER)
 
 confirm: setup ## one full batch of every cell again, hours; goes on where it was [CHAPTER=lqr] [SINCE=commit]
-	@$(IN_VENV) -m experiments.confirm $(CHAPTER) $(if $(SINCE),--since $(SINCE))
+	@$(IN_VENV) -m experiments.confirm $(CHAPTER) $(if $(SINCE),--since $(SINCE)) $(SCHEDULED)
 
-reproduce: setup ## every result from nothing, into data/reproduced [CHAPTER=lqr]
+reproduce: setup ## every result from nothing, into data/reproduced, hours; goes on where it was [CHAPTER=lqr]
+	@$(IN_VENV) -m experiments.reproduce $(CHAPTER) $(SCHEDULED)
 	@rm -rf book/_executed/paper
 	@$(IN_VENV) book/build.py --profile paper $(if $(CHAPTER),--chapter $(CHAPTER)) $(SETUP_SECONDS)
-	@echo "The rows are in data/reproduced"
 
 claims: setup ## decide every claim of the paper again from the rows in data/
 	@$(IN_VENV) book/claims.py

@@ -11,6 +11,7 @@ from pathlib import Path
 import nbformat
 
 import claims
+import costs
 import licences
 import provenance
 from chapters import Notebook, tree_hash
@@ -48,10 +49,12 @@ def stage(root: Path, source: Path, notebooks: list[Notebook], profile: str) -> 
     )
     for notebook in notebooks:
         nbformat.write(notebook.read_executed(), source / f"{notebook.name}.ipynb")
-    (source / "run_times.md").write_text(run_times_page(notebooks, profile), encoding="utf-8")
     claims.write_fragments(source)
     provenance.write_fragment(source)
+    costs.write_fragment(source)
     licences.write_fragment(source)
+    run_times = source / "_generated" / "run_times.md"
+    run_times.write_text(run_times_tables(notebooks, profile), encoding="utf-8")
 
 
 def run_jupyter_book(source: Path, output: Path) -> Path:
@@ -91,8 +94,8 @@ def exchanged(one: Path, other: Path) -> bool:
     return swap is not None and swap(here, bytes(one), here, bytes(other), exchange) == 0
 
 
-def run_times_page(notebooks: list[Notebook], profile: str) -> str:
-    """The page of run times, from what papermill measured when it executed each notebook."""
+def run_times_tables(notebooks: list[Notebook], profile: str) -> str:
+    """Tables of how long notebooks and cells took, from what papermill measured."""
     records = {notebook.name: notebook.read_record() for notebook in notebooks}
     totals = [
         [
@@ -115,12 +118,6 @@ def run_times_page(notebooks: list[Notebook], profile: str) -> str:
     ]
     return "\n".join(
         [
-            "# Run times",
-            "",
-            "How long each notebook of this site took, from papermill's own record. A notebook is",
-            "executed again only when its code, parameters, data, packages or the modules of `ipo`",
-            "that it imports change, so the dates may differ.",
-            "",
             *table(["Notebook", "Profile", "Seconds", "Cores", "Versions", "Date"], totals),
             "",
             "The slowest cells:",

@@ -11,6 +11,7 @@ import pytest
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
 
 import claims
+import costs
 import provenance
 import sources
 from build import main
@@ -30,6 +31,7 @@ FILES = {
     "{file: run_times}]\n",
     "environment.txt": "numpy==2\n",
     "book/intro.md": "# A toy\n\nSee [](plain.ipynb).\n",
+    "book/run_times.md": "# Run times\n\n```{include} _generated/run_times.md\n```\n",
     "data/paper/table.csv": "1\n",
     "data/results/plain/rows.csv": "1\n",
     "ipo/__init__.py": "",
@@ -85,7 +87,8 @@ def in_toy(patch: pytest.MonkeyPatch, root: Path) -> None:
     """The toy's own package, and no claims."""
     patch.setattr(sources, "PACKAGES", {"ipo": root / "ipo"})
     patch.setattr(claims, "write_fragments", lambda folder: None)
-    patch.setattr(provenance, "write_fragment", lambda folder: None)
+    for page in (provenance, costs):
+        patch.setattr(page, "write_fragment", lambda folder: None)
 
 
 def executed(root: Path, name: str) -> Path:

@@ -1,6 +1,6 @@
 """One full batch of every cell again: before a release, or after a change on purpose.
 
-    python -m experiments.confirm [--since COMMIT] [lqr keys/main ...]
+    python -m experiments.confirm [--since COMMIT] [--scheduler tcp://...] [lqr keys/main ...]
 
 For each cell the first recorded batch is computed again and held beside the shipped rows:
 
@@ -21,11 +21,11 @@ import datetime
 import json
 import sys
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import joblib
 import pandas as pd
 import scipy.stats
 from filelock import FileLock
@@ -37,7 +37,7 @@ from experiments.orphans import interrupt_on_sigterm
 from experiments.registry import DATA, chosen
 from experiments.store import Store, select
 from experiments.witness import Slice, side_by_side, within
-from experiments.workers import parallel
+from experiments.work import finished
 
 CONFIRMED = DATA / "confirmed.json"
 CHAOTIC = (
@@ -65,16 +65,18 @@ def title(part: Slice) -> str:
     return " ".join([f"{part.chapter}/{part.name}", *map(str, part.batch["columns"].values())])
 
 
-def confirm(names: Sequence[str] = (), since: str | None = None) -> list[str]:
-    """Confirm what is not, on all cores; returns the titles of the cells that differ."""
+def confirm(
+    names: Sequence[str] = (), since: str | None = None, scheduler: str | None = None
+) -> list[str]:
+    """Confirm what is not, on all cores or by a dask scheduler; returns the cells that differ."""
     done = confirmed()
     waiting = [part for part in full_batches(names) if not _is_done(done, title(part), since)]
     waiting.sort(key=lambda part: -part.batch["cpu_seconds"])  # long ones first: no idle core
     total = sum(part.batch["cpu_seconds"] for part in waiting) / 60
     print(f"{len(waiting)} cells, {total:.0f} CPU-minutes by their records", flush=True)
     with TemporaryDirectory() as scratch:
-        jobs = (joblib.delayed(_outcome)(part, Path(scratch)) for part in waiting)
-        work = parallel(-1, return_as="generator_unordered")(jobs)
+        jobs = [partial(_outcome, part, Path(scratch)) for part in waiting]
+        work = finished(jobs, -1, scheduler)
         for cell, outcome in tqdm(work, total=len(waiting), unit="cell"):
             _save(cell, outcome)
     record = confirmed()
@@ -89,15 +91,22 @@ def confirmed() -> dict[str, dict[str, Any]]:
 def compared(part: Slice, rows: pd.DataFrame) -> str:
     """How rows that were computed again compare with the shipped ones."""
     store = Store(DATA / "results" / part.chapter, part.name)
-    both = side_by_side(store.rows_of(part.batch), rows)
+    recorded = store.rows_of(part.batch)
+    if how := agreement(part.chapter, recorded, rows):
+        return how
+    both = side_by_side(recorded, rows)
+    chaotic = both is not None and f"{part.chapter}/{part.name}" in CHAOTIC
+    return "alike" if chaotic and alike(store.rows(), part.batch["columns"], both) else "differs"
+
+
+def agreement(chapter: str, recorded: pd.DataFrame, rows: pd.DataFrame) -> str | None:
+    """Whether rows are ``exact`` or ``close``; None: neither."""
+    both = side_by_side(recorded, rows)
     if both is None:
-        return "differs"
+        return None
     if (both["value"] == both["value_now"]).all():
         return "exact"
-    if within(both, part.chapter, LONGER).all():
-        return "close"
-    chaotic = f"{part.chapter}/{part.name}" in CHAOTIC
-    return "alike" if chaotic and alike(store.rows(), part.batch["columns"], both) else "differs"
+    return "close" if within(both, chapter, LONGER).all() else None
 
 
 def alike(shipped: pd.DataFrame, columns: dict[str, Any], both: pd.DataFrame) -> bool:
@@ -148,9 +157,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("names", nargs="*", help="chapters, or experiments such as lqr/tables")
     parser.add_argument("--since", help="what was confirmed at this commit, or later, counts")
+    parser.add_argument("--scheduler", help="address of a dask scheduler whose workers compute")
     options = parser.parse_args()
     interrupt_on_sigterm()
-    if different := confirm(options.names, options.since):
+    if different := confirm(options.names, options.since, options.scheduler):
         sys.exit("These cells differ from the shipped rows:\n" + "\n".join(different))
 
 

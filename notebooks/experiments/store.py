@@ -21,10 +21,10 @@ import tempfile
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-import joblib
 import pandas as pd
 from filelock import FileLock
 from tqdm import tqdm
@@ -34,7 +34,7 @@ from experiments.experiment import Cell, Experiment, difference, filled, plain
 from experiments.files import check_file_name, replace_text
 from experiments.rows import ResultsError, check_rows, types_of
 from experiments.sealed import digest_of
-from experiments.workers import parallel
+from experiments.work import finished
 from ipo.checks import check_counts
 
 KEYS = {"columns", "cell", "run", "options", "seeds", "reads", "num_rows", "sha256"}  # of a batch
@@ -93,6 +93,7 @@ class Store:
         cells: Sequence[Cell],
         seeds: Sequence[int],
         num_workers: int | None = None,
+        scheduler: str | None = None,
     ) -> pd.DataFrame:
         """The rows of ``cells`` x ``seeds``: loaded where they exist, computed where they do not.
 
@@ -100,7 +101,7 @@ class Store:
             experiment: how rows are made.
             cells: the configurations; their ``columns`` are the first columns of their rows.
             seeds: the runs of every cell.
-            num_workers: processes that compute; ``None`` leaves it to ``joblib.parallel_config``.
+            num_workers, scheduler: who computes; see :func:`experiments.work.finished`.
 
         Every finished batch is saved at once: after an interruption the next call goes on with
         what is missing and ends with the same rows. Check-points are removed last, when the rows
@@ -110,41 +111,57 @@ class Store:
             ResultsError: files that are damaged, a folder that cannot be written, or rows that
                 would not come back as they are; see :func:`experiments.rows.check_rows`.
             OriginError: rows of another cell, option, run function or input than asked for.
+            WorkError: a scheduler that cannot be reached or is lost.
         """
         check_counts("seeds", seeds, minimum=0)
         rows, batches = self._read()
-        for cell in cells:
-            for batch in batches:
-                if batch["columns"] == cell.columns:
-                    self._check_origin(experiment, cell, seeds, batch)
         size = experiment.runs_at_once or len(seeds)
-        lacking = [(cell, _lacking(cell, seeds, batches)) for cell in cells]
+        lacking = [(cell, self._missing(experiment, cell, seeds, batches)) for cell in cells]
         missing = [
             (cell, runs[i : i + size]) for cell, runs in lacking for i in range(0, len(runs), size)
         ]
         if missing:
             self._check_storable([cell for cell, _ in missing])
-            self._check_writable()
-            jobs = (joblib.delayed(timed)(experiment.run, cell, runs) for cell, runs in missing)
-            work = parallel(num_workers, return_as="generator_unordered")(jobs)
-            for cell, new_rows, cost in tqdm(
+            self.check_writable()
+            jobs = [partial(timed, experiment.run, cell, runs) for cell, runs in missing]
+            work = finished(jobs, num_workers, scheduler)
+            for cell, new_rows, made in tqdm(
                 work, desc=self.name, total=len(missing), unit="batch"
             ):
-                self._add(experiment, cell, new_rows, cost)
+                self.add(experiment, cell, new_rows, made)
             rows, _ = self._read()
-        self._remove_checkpoints(experiment, cells, seeds)
+        self.remove_checkpoints(experiment, cells, seeds)
         wanted = rows[rows["run"].isin(seeds)]
         return pd.concat([select(wanted, cell.columns) for cell in cells], ignore_index=True)
 
-    def _remove_checkpoints(
+    def remove_checkpoints(
         self, experiment: Experiment, cells: Sequence[Cell], seeds: Sequence[int]
     ) -> None:
-        """Remove what carried work whose rows have been read from the files."""
-        if experiment.checkpoints:
-            for cell, seed in itertools.product(cells, seeds):
-                for path in experiment.checkpoints(cell, seed):
-                    if path.exists():  # a folder that is read-only forbids removing nothing
-                        path.unlink()
+        """Remove what carried work, now that its rows can be read from the files."""
+        if experiment.checkpoints is None:
+            return
+        runs = itertools.product(cells, seeds)
+        paths = [path for cell, seed in runs for path in experiment.checkpoints(cell, seed)]
+        if there := [path for path in paths if path.exists()]:
+            self._read()
+            for path in there:
+                path.unlink()
+
+    def lacking(self, experiment: Experiment, cell: Cell, seeds: Sequence[int]) -> list[int]:
+        """The runs of a cell that are not there yet.
+
+        Raises:
+            ResultsError, OriginError: as in :meth:`fill`; rows are not looked at.
+        """
+        return self._missing(experiment, cell, seeds, self.batches())
+
+    def _missing(
+        self, experiment: Experiment, cell: Cell, seeds: Sequence[int], batches: list[Batch]
+    ) -> list[int]:
+        for batch in batches:
+            if batch["columns"] == cell.columns:
+                self._check_origin(experiment, cell, seeds, batch)
+        return _lacking(cell, seeds, batches)
 
     def _read(self) -> tuple[pd.DataFrame, list[Batch]]:
         """Rows and batches, every batch checked against its rows."""
@@ -222,8 +239,8 @@ class Store:
                 f"{self.csv.name} and {self.json.name} away, or name another folder for the results"
             )
 
-    def _add(
-        self, experiment: Experiment, cell: Cell, rows: pd.DataFrame, cost: dict[str, float]
+    def add(
+        self, experiment: Experiment, cell: Cell, rows: pd.DataFrame, made: dict[str, Any]
     ) -> None:
         """Add the rows of one cell. Two programs may fill the same files at the same time.
 
@@ -241,11 +258,8 @@ class Store:
                 "seeds": seeds,
                 "num_rows": len(rows),
                 "sha256": digest(rows),
-                "versions": origin.versions(),
-                "machine": origin.machine(),
-                "commit": origin.commit(),
                 "finished": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-                **cost,
+                **made,
             }
             batches = sorted(
                 [*batches, batch], key=lambda b: json.dumps([b["columns"], b["seeds"]])
@@ -294,7 +308,7 @@ class Store:
                         f"{self.csv}: {column} = {value!r} of {cell.columns}: must be {rule}"
                     )
 
-    def _check_writable(self) -> None:
+    def check_writable(self) -> None:
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             tempfile.TemporaryFile(dir=self.folder).close()
@@ -312,16 +326,19 @@ def type_of(value: Any) -> str:
 
 
 def timed(run: Callable, cell: Cell, seeds: list[int]) -> tuple[Cell, pd.DataFrame, dict]:
-    """The rows of a run, checked, values to nine digits, and what they cost."""
+    """The rows of a run, checked, values to nine digits; where they were made; what they cost."""
     wall, cpu = time.perf_counter(), time.process_time()
     rows = run(cell, seeds)
-    cost = {
+    made = {
         "cpu_seconds": round(time.process_time() - cpu, 2),
         "wall_seconds": round(time.perf_counter() - wall, 2),
+        "versions": origin.versions(),
+        "machine": origin.machine(),
+        "commit": origin.commit(),
     }
     check_rows(cell, seeds, rows)
     rows["value"] = [float(f"{value:.9g}") for value in rows["value"]]
-    return cell, rows, cost
+    return cell, rows, made
 
 
 def asked(experiment: Experiment, cell: Cell, seeds: Sequence[int]) -> dict[str, Any]:

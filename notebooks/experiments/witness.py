@@ -17,10 +17,10 @@ import io
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-import joblib
 import pandas as pd
 from tqdm import tqdm
 
@@ -29,7 +29,7 @@ from experiments.experiment import Cell, rebuilt
 from experiments.orphans import interrupt_on_sigterm
 from experiments.registry import CHAPTERS, DATA, again, chosen
 from experiments.store import Batch, Store, timed
-from experiments.workers import parallel
+from experiments.work import finished
 
 WITNESS = DATA / "witness"
 
@@ -84,19 +84,18 @@ def verify(names: Sequence[str] = (), num_workers: int = -1) -> list[str]:
         if cell.columns not in [s.batch["columns"] for s in recorded if s.name == name]
     ]
     with TemporaryDirectory() as scratch:
-        jobs = (joblib.delayed(_attempt)(part, Path(scratch)) for part in recorded)
-        work = parallel(num_workers, return_as="generator")(jobs)
-        for part, rows in tqdm(zip(recorded, work, strict=True), total=len(recorded), unit="slice"):
+        jobs = [partial(_attempt, part, Path(scratch)) for part in recorded]
+        for part, rows in tqdm(finished(jobs, num_workers), total=len(jobs), unit="slice"):
             problems += differences(part, rows)
-    return problems
+    return sorted(problems)  # slices come as they are finished
 
 
-def _attempt(part: Slice, scratch: Path) -> pd.DataFrame | str:
+def _attempt(part: Slice, scratch: Path) -> tuple[Slice, pd.DataFrame | str]:
     try:
         with contextlib.redirect_stderr(io.StringIO()):  # bars of single trainings
-            return part.run(scratch)
+            return part, part.run(scratch)
     except Exception as error:  # whatever it is, it is a difference, and the others go on
-        return f"{type(error).__name__}: {error}"
+        return part, f"{type(error).__name__}: {error}"
 
 
 def differences(part: Slice, rows: pd.DataFrame | str) -> list[str]:

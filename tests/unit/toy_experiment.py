@@ -51,11 +51,12 @@ def fill(
     seeds: Sequence[int] = SEEDS,
     run: Callable = run,
     num_workers: int = 1,
+    scheduler: str | None = None,
     **options,
 ) -> pd.DataFrame:
     """Run or load ``folder/toy.csv``; options are those of an ``Experiment``."""
     return Store(Path(folder), "toy").fill(
-        Experiment(run, Cell, **options), cells, seeds, num_workers
+        Experiment(run, Cell, **options), cells, seeds, num_workers, scheduler
     )
 
 

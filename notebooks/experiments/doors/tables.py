@@ -26,7 +26,7 @@ from experiments.doors.arms import (
 from experiments.doors.authors_policies import authors_policies
 from experiments.doors.success import Cell
 from experiments.doors.training import CURVE_FRICTION, EVALUATION_SEED, TRAIN_FRICTIONS, last_info
-from experiments.workers import parallel
+from experiments.work import parallel
 from ipo.stats import paired_difference, probability_of_improvement
 
 PAIRS = {

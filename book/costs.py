@@ -1,0 +1,100 @@
+"""What it costs to compute every row from nothing, by the record beside the shipped rows."""
+
+from __future__ import annotations
+
+import json
+from itertools import groupby
+from pathlib import Path
+
+import pandas as pd
+
+from experiments.registry import CHAPTERS, DATA
+from experiments.reproduce import cost, recorded, wall_seconds
+
+CORES = (1, 2, 4, 8, 16, 32, 64)
+SCALING = DATA / "bench" / "scaling.json"
+
+
+def write_fragment(folder: Path) -> None:
+    """Writes ``_generated/costs.md`` under ``folder``."""
+    target = Path(folder) / "_generated"
+    target.mkdir(parents=True, exist_ok=True)
+    bench = json.loads(SCALING.read_text(encoding="utf-8"))
+    text = "\n\n".join([core_hours(), scaling(bench), wall_hours(bench), limits(bench)])
+    (target / "costs.md").write_text(text + "\n", encoding="utf-8")
+
+
+def core_hours() -> str:
+    """A table of experiments, with the sum of each chapter and of all."""
+    everything = [part for wave in recorded([]) for part in wave]
+    everything.sort(key=lambda part: list(CHAPTERS).index(part.chapter))
+    lines = []
+    for chapter, parts in groupby(everything, lambda part: part.chapter):
+        own = list(parts)
+        lines.append(line(f"**{chapter}**", own))
+        for name in CHAPTERS[chapter]:
+            lines.append(line(f"{chapter}/{name}", [part for part in own if part.name == name]))
+    lines.append(line("**all**", everything))
+    return in_markdown(pd.DataFrame(lines))
+
+
+def line(title: str, parts: list) -> dict[str, str]:
+    costs = [cost(part) for part in parts]
+    return {
+        "Rows": title,
+        "Batches": str(len(parts)),
+        "Core-hours": f"{sum(costs) / 3600:.2f}",
+        "Longest batch [min]": f"{max(costs) / 60:.1f}",
+    }
+
+
+def scaling(bench: dict) -> str:
+    """How much faster two workers are than one, in words."""
+    median = bench["median"]
+    return (
+        f"A sweep of {median['CPU-seconds']:.0f} CPU-seconds (`tests/bench/bench_scaling.py`, "
+        f"{bench['machine']}, load {median['load before']:.1f} before it began, median of "
+        f"{bench['rounds']}) was {median['times as fast']:.2f} times as fast with two workers as "
+        f"with one, and its jobs cost {median['CPU-seconds beside each other']:.2f} times as many "
+        "CPU-seconds beside each other as alone. With this factor for more than one core, and "
+        "long batches first, chapters take so many hours of wall time:"
+    )
+
+
+def wall_hours(bench: dict) -> str:
+    """A table of wall times by the number of cores."""
+    factor = bench["median"]["CPU-seconds beside each other"]
+    chapters = {chapter: [chapter] for chapter in CHAPTERS if any(recorded([chapter]))} | {
+        "all": []
+    }
+    costs = {
+        title: [[cost(part) for part in wave] for wave in recorded(names)]
+        for title, names in chapters.items()
+    }
+    lines = [
+        {"Cores": str(cores)}
+        | {
+            title: f"{wall_seconds(waves, cores) * (factor if cores > 1 else 1) / 3600:.2f}"
+            for title, waves in costs.items()
+        }
+        for cores in CORES
+    ]
+    return in_markdown(pd.DataFrame(lines))
+
+
+def limits(bench: dict) -> str:
+    """What keeps more cores from helping, in words."""
+    longest = [max(wave, key=cost) for wave in recorded([])]
+    trained, played = ([f"{p.chapter}/{p.name}", cost(p) / 60] for p in longest)
+    memory = ", ".join(f"{gib:.1f} GiB for `{name}`" for name, gib in bench["gib"].items())
+    return (
+        f"What limits it is the longest batch, {trained[1]:.0f} minutes of `{trained[0]}`, which "
+        f"does not become shorter on more cores, and after it the longest that reads its policies, "
+        f"{played[1]:.1f} minutes of `{played[0]}`. A worker needs memory: {memory}."
+    )
+
+
+def in_markdown(table: pd.DataFrame) -> str:
+    """A table of text whose columns but the first are numbers."""
+    align = ["left"] + ["right"] * (table.shape[1] - 1)
+    return table.to_markdown(index=False, colalign=align, disable_numparse=True)

@@ -1,0 +1,192 @@
+"""Every result from nothing, into ``data/reproduced``, and how it compares with what is shipped.
+
+    python -m experiments.reproduce [--scheduler tcp://...] [door keys ...]
+
+All batches of the shipped record are computed again, with their own tables and policies: first
+the trainings, then what reads the policies that come out. Each batch is saved when it is finished
+and a training after every update, so that an interrupted command goes on. In the end the runs of
+every cell are held beside the shipped ones:
+
+- ``exact`` and ``close``: as ``experiments.confirm`` says;
+- ``alike``: where networks are trained, which is chaotic, other runs of the same cell;
+- ``differs`` otherwise, and the command fails.
+"""
+
+from __future__ import annotations
+
+import argparse
+import heapq
+import sys
+from collections.abc import Iterable, Sequence
+from functools import partial
+from typing import Any
+
+import pandas as pd
+import scipy.stats
+from tqdm import tqdm
+
+from experiments.confirm import CHAOTIC, LEVEL, agreement
+from experiments.experiment import Cell, Experiment, Places, rebuilt
+from experiments.registry import CHAPTERS, DATA, chosen
+from experiments.store import Store, select, timed
+from experiments.witness import Slice
+from experiments.work import finished, num_at_once
+from ipo.checks import check_choice
+
+BAR = "{desc}: {percentage:.1f} % of the time{postfix}; {elapsed} gone, {remaining} left"
+OUTCOMES = ("exact", "close", "alike", "differs")
+
+
+def reproduce(
+    chapters: Sequence[str] = (), num_workers: int = -1, scheduler: str | None = None
+) -> pd.DataFrame:
+    """Compute what is not reproduced yet; returns :func:`comparison` of all."""
+    waves = recorded(chapters)
+    costs = [[cost(part) for part in wave if lacking(part)] for wave in waves]
+    total, left = sum(cost(part) for wave in waves for part in wave), sum(map(sum, costs))
+    at_once = num_at_once(num_workers, scheduler)
+    print(
+        f"{sum(map(len, costs))} batches, {left / 3600:.1f} core-hours by their records: about "
+        f"{wall_seconds(costs, at_once) / 3600:.1f} hours, {at_once} at a time",
+        flush=True,
+    )
+    # Seconds of the record are what is counted, so the time left follows from today's speed.
+    options = {"total": total, "initial": total - left, "bar_format": BAR}
+    with tqdm(**options, desc="reproduced", smoothing=0, miniters=1) as bar:
+        for wave in waves:
+            compute(wave, bar, num_workers, scheduler)
+    return comparison(chapters)
+
+
+def recorded(chapters: Sequence[str]) -> list[list[Slice]]:
+    """The shipped batches in the order in which they depend on each other: two waves.
+
+    What reads policies comes after what makes them.
+    """
+    for chapter in chapters:
+        check_choice("chapter", chapter, list(CHAPTERS))
+    waves: list[list[Slice]] = [[], []]
+    for chapter, name in chosen(chapters):
+        batches = Store(DATA / "results" / chapter, name).batches()
+        reading = CHAPTERS[chapter][name].reads is not None
+        waves[reading] += [Slice(chapter, name, batch) for batch in batches]
+    return waves
+
+
+def cost(part: Slice) -> float:
+    """CPU-seconds of a batch by its record."""
+    return part.batch["cpu_seconds"]
+
+
+def compute(
+    wave: Sequence[Slice], bar: tqdm, num_workers: int, scheduler: str | None = None
+) -> None:
+    """Compute and save what is missing of batches that do not depend on each other."""
+    waiting = [(part, seeds) for part in wave if (seeds := lacking(part))]
+    waiting.sort(key=lambda pair: -cost(pair[0]))  # long ones first: no idle core
+    for part, _ in waiting:
+        store(part).check_writable()
+    jobs = [partial(_computed, part, seeds) for part, seeds in waiting]
+    for part, cell, rows, made in finished(jobs, num_workers, scheduler):
+        store(part).add(experiment(part), cell, rows, made)
+        store(part).remove_checkpoints(experiment(part), [cell], part.batch["seeds"])
+        bar.set_postfix_str(f"{part.chapter}/{part.name}", refresh=False)
+        bar.update(cost(part))
+
+
+def _computed(part: Slice, seeds: list[int]) -> tuple[Slice, Cell, pd.DataFrame, dict[str, Any]]:
+    return part, *timed(experiment(part).run, cell_of(part), seeds)
+
+
+def cell_of(part: Slice) -> Cell:
+    return rebuilt(CHAPTERS[part.chapter][part.name].cell, part.batch["cell"])
+
+
+def experiment(part: Slice) -> Experiment:
+    """As in the profile ``paper``: tables, policies and check-points are its own, too."""
+    folder = DATA / "reproduced"
+    places = Places(
+        tables=folder / "tabulated",
+        policies=folder / part.chapter / "policies",
+        checkpoints=folder / part.chapter / "checkpoints",
+    )
+    return CHAPTERS[part.chapter][part.name].at(places)
+
+
+def store(part: Slice) -> Store:
+    return Store(DATA / "reproduced" / part.chapter, part.name)
+
+
+def lacking(part: Slice) -> list[int]:
+    """The runs of a batch that are not reproduced yet."""
+    return store(part).lacking(experiment(part), cell_of(part), part.batch["seeds"])
+
+
+def wall_seconds(waves: Iterable[Iterable[float]], num_workers: int) -> float:
+    """How long batches of so many seconds take side by side: whoever is free takes the longest."""
+    total = 0.0
+    for wave in waves:
+        ends = [0.0] * num_workers
+        for seconds in sorted(wave, reverse=True):
+            heapq.heapreplace(ends, ends[0] + seconds)
+        total += max(ends)
+    return total
+
+
+# ------------------------------------------------------------------ beside what is shipped
+
+
+def comparison(chapters: Sequence[str]) -> pd.DataFrame:
+    """A row for every experiment: its cells, and how many of them came out how."""
+    lines = []
+    for chapter, name in chosen(chapters):
+        shipped = Store(DATA / "results" / chapter, name)
+        if not shipped.batches():
+            continue
+        old, new = shipped.rows(), Store(DATA / "reproduced" / chapter, name).rows()
+        cells = {str(b["columns"]): b["columns"] for b in shipped.batches()}.values()
+        found = [outcome(chapter, name, select(old, c), select(new, c)) for c in cells]
+        counts = {how: found.count(how) for how in OUTCOMES}
+        lines.append({"experiment": f"{chapter}/{name}", "cells": len(found), **counts})
+    return pd.DataFrame(lines, columns=["experiment", "cells", *OUTCOMES])
+
+
+def outcome(chapter: str, name: str, shipped: pd.DataFrame, again: pd.DataFrame) -> str:
+    """How all runs of a cell compare with the shipped ones."""
+    trained = f"{chapter}/{name}" in CHAOTIC or CHAPTERS[chapter][name].reads is not None
+    how = agreement(chapter, shipped, again)
+    return how or ("alike" if trained and alike(shipped, again) else "differs")
+
+
+def alike(shipped: pd.DataFrame, again: pd.DataFrame) -> bool:
+    """Whether all runs of a cell, ten or more, could be other runs of it.
+
+    Of every domain and metric, runs have their mean over learning curves and doors. No p-value of
+    a Kolmogorov-Smirnov test between the two sets of runs is below LEVEL over their number.
+    """
+    old, new = (
+        rows[rows["metric"] != "cpu_seconds"].pivot_table("value", "run", ["domain", "metric"])
+        for rows in (shipped, again)
+    )
+    if set(old.columns) != set(new.columns):
+        return False
+    p = [scipy.stats.ks_2samp(old[place].dropna(), new[place].dropna()).pvalue for place in old]
+    return min(p) > LEVEL / len(p)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("chapters", nargs="*", metavar="chapter", help="all if none is named")
+    parser.add_argument("--scheduler", help="address of a dask scheduler whose workers compute")
+    options = parser.parse_args()
+    try:
+        table = reproduce(options.chapters, scheduler=options.scheduler)
+    except KeyboardInterrupt:
+        sys.exit("Interrupted; the same command goes on where it was")
+    print(table.to_string(index=False))
+    if different := table["differs"].sum():
+        sys.exit(f"{different} cells differ from the shipped rows")
+
+
+if __name__ == "__main__":
+    main()
