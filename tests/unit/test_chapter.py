@@ -46,7 +46,7 @@ def test_nowhere_is_a_folder_that_goes():
 
 @pytest.mark.parametrize("results_dir", [5, "", True, ["rows"]])
 def test_a_folder_must_be_a_path(results_dir):
-    with pytest.raises(ValueError, match=r"results_dir = .*: must be a folder's path, or None"):
+    with pytest.raises(ValueError, match=r"results_dir = .*: must be the path of a folder"):
         chapter(results_dir)
 
 
