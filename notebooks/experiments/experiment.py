@@ -55,8 +55,8 @@ class Experiment:
         short: the slice of a cell that ``make verify`` computes again: the same cell with few
             iterations, updates or doors. ``None`` for a cell of which another one has the slice.
         seeds: of the slice.
-        reads: ``reads(cell, seed)`` are the files that a run reads, each behind a seal
-            (:mod:`experiments.sealed`); ``None``: it reads none.
+        reads: ``reads(cell, seed)`` are the files that a run reads, each behind a seal as
+            policies are; ``None``: it reads none.
         runs_at_once: runs of a cell that are computed, and saved, together; ``None``: all.
         checkpoints: ``checkpoints(cell, seed)`` are the files that carry the work of a run. It is
             not the run that removes them but the store, when the rows are saved and read back.

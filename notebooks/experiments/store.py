@@ -109,7 +109,8 @@ class Store:
 
         Raises:
             ResultsError: files that are damaged, a folder that cannot be written, or rows that
-                would not come back as they are; see :func:`experiments.rows.check_rows`.
+                are not those of their cell and runs, each once, or that would not come back as
+                they are.
             OriginError: rows of another cell, option, run function or input than asked for.
             WorkError: a scheduler that cannot be reached or is lost.
         """
@@ -192,7 +193,7 @@ class Store:
         return pd.concat(parts, ignore_index=True)
 
     def _record(self) -> tuple[dict[str, str], list[Batch]]:
-        """The types of the columns, and the batches."""
+        """The types of the columns of the rows that there are, and the batches."""
         if not self.json.exists():
             if self.csv.exists():
                 raise ResultsError(
@@ -207,7 +208,7 @@ class Store:
                     raise KeyError(f"a batch without {min(absent)}")
         except (ValueError, KeyError, TypeError, AttributeError, OSError) as error:
             raise ResultsError(f"{self.json.with_suffix('')}: cannot be read: {error}") from error
-        return types, batches
+        return types if batches else {}, batches
 
     def _checked(self, rows: pd.DataFrame, batch: Batch) -> pd.DataFrame:
         part = select(rows[rows["run"].isin(batch["seeds"])], batch["columns"])

@@ -12,7 +12,7 @@ from execute import DATA, tree_hash
 
 ROOT = Path(__file__).resolve().parents[2]
 NAMES = [path.stem for path in sorted((ROOT / "notebooks").glob("*.ipynb"))]
-QUICK = ("keys", "your_own_domains")
+QUICK = ("lqr", "your_own_domains")
 SMOKE = yaml.safe_load((ROOT / "notebooks" / "profiles" / "smoke.yml").read_text())
 
 

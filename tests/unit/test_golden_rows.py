@@ -8,6 +8,7 @@ import pytest
 
 from experiments import lqr
 from experiments.experiment import filled
+from experiments.paper import read_paper
 from experiments.store import Store, asked
 
 DATA = Path(__file__).resolve().parents[2] / "data"
@@ -51,7 +52,7 @@ def means(costs) -> pd.Series:
 @pytest.fixture(scope="module")
 def paper() -> pd.DataFrame:
     """Both tables; the configuration that stands in both has the same numbers in both."""
-    table = pd.read_csv(DATA / "paper" / "lqr.csv").drop(columns="table").drop_duplicates()
+    table = read_paper("lqr").drop(columns="table").drop_duplicates()
     return table.set_index(CONFIGURATION)
 
 
