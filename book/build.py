@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import shutil
 import sys
 import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import chain
 from pathlib import Path
 
 import joblib
@@ -107,9 +109,9 @@ def alone(output: Path) -> Iterator[None]:
 
 def remove_unfinished(output: Path) -> None:
     """What a build leaves that was killed."""
-    for pattern in UNFINISHED:
-        for path in output.glob(pattern):
-            path.unlink()
+    for path in chain.from_iterable(map(output.glob, UNFINISHED)):
+        path.unlink()
+    shutil.rmtree(output / "_build" / "new", ignore_errors=True)
 
 
 def execute_and_build(

@@ -73,9 +73,9 @@ def is_installed():
 
 @contextlib.contextmanager
 def alone():
-    """One set-up at a time. Its lock is that of the folder, and held by its pip, too."""
+    """One set-up at a time: the folder is locked, also by what `run` starts and a kill leaves."""
     folder = os.open(ROOT, os.O_RDONLY)
-    os.set_inheritable(folder, True)  # to what `run` starts, and a kill leaves behind
+    os.set_inheritable(folder, True)
     try:
         fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -111,7 +111,7 @@ def pip_install(*options):
 
 
 def uv_install(*options):
-    """Whether uv could; it needs a tenth of pip's time, but not all that pip is configured with."""
+    """Whether uv could: it is much faster than pip, but has a configuration of its own."""
     listing = subprocess.run([*PIP, "config", "list"], capture_output=True, text=True).stdout
     index = re.search(r"\.index-url='(.+)'", listing)
     settings = [f"UV_DEFAULT_INDEX={index[1]}"] if index else []

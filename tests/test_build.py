@@ -4,34 +4,44 @@ import json
 import shutil
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import nbformat
 import pytest
+import setup
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
 
+import build
 import claims
 import costs
 import provenance
 import sources
+import website
 from build import main
 from chapters import tree_hash
+from messages import BuildError
 from profiles import load_notebooks
 
+ROOT = Path(__file__).resolve().parents[1]
 PROFILES = {
     "class": "plain: {num_runs: 3}\n",
     "unknown_notebook": "plane: {num_runs: 3}\n",
     "unknown_parameter": "plain: {num_rums: 3}\n",
     "no_mapping": "- plain\n",
     "no_parameters": "plain: 3\n",
+    "broken": "plain:\n  num_runs: [3\n",
+    "other_type": "plain: {num_runs: three}\n",
+    "other_list": "plain: {num_runs: [3]}\n",
 }
 FILES = {
     "_config.yml": "title: A toy\nexecute: {execute_notebooks: 'off'}\n",
     "_toc.yml": "format: jb-book\nroot: intro\nchapters: [{file: plain}, {file: painted}, "
-    "{file: run_times}]\n",
+    "{file: run_times}, {file: licences}]\n",
     "environment.txt": "numpy==2\n",
     "book/intro.md": "# A toy\n\nSee [](plain.ipynb).\n",
     "book/run_times.md": "# Run times\n\n```{include} _generated/run_times.md\n```\n",
+    "book/licences.md": (ROOT / "book" / "licences.md").read_text(),
     "data/paper/table.csv": "1\n",
     "data/results/plain/rows.csv": "1\n",
     "ipo/__init__.py": "",
@@ -243,7 +253,11 @@ def test_warning_of_the_site_ends_the_build_and_leaves_the_last_good_one(toy, ca
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
-        (["--profile", "clas"], "no profile 'clas'; the profiles are class"),
+        (["--profile", "clas"], "no profile 'clas'; the profiles are broken, class"),
+        (["--profile", "../profiles/class"], "no profile '../profiles/class'; the profiles are"),
+        (["--profile", "broken"], "notebooks/profiles/broken.yml, line 3: is no YAML"),
+        (["--profile", "other_type"], "gives plain num_runs = 'three': must be of type int, as 10"),
+        (["--profile", "other_list"], "gives plain num_runs = [3]: must be of type int, as 10"),
         (["--profile", "unknown_notebook"], "names plane, but the notebooks in _toc.yml are"),
         (["--profile", "unknown_parameter"], "gives plain the parameter num_rums"),
         (["--profile", "no_mapping"], "must map notebooks to parameters"),
@@ -265,12 +279,126 @@ def test_number_of_jobs_is_checked(toy, capsys, jobs):
     assert "--jobs" in capsys.readouterr().err
 
 
+def test_folder_that_cannot_be_written_is_named_with_the_cause(toy, capsys):
+    folder = toy / "environment.txt" / "folder"
+    assert main(["--output", str(folder)], toy) == 1
+    error = capsys.readouterr().err
+    assert "environment.txt/folder/_build cannot be written: Not a directory" in error
+    assert "--output" in error
+
+
+# ------------------------------------------------------------- two at once, and what was killed
+
+
+@pytest.mark.parametrize("alone", [build.alone, setup.alone], ids=["build", "set-up"])
+def test_the_second_waits_for_the_first_and_says_so(alone, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(setup, "ROOT", tmp_path)
+    (tmp_path / "_build").mkdir()
+    folder = [tmp_path] if alone is build.alone else []
+    began = threading.Event()
+
+    def second() -> None:
+        with alone(*folder):
+            began.set()
+
+    thread = threading.Thread(target=second)
+    with alone(*folder):
+        thread.start()
+        assert not began.wait(0.3)
+    thread.join(10)
+    assert began.is_set()
+    assert "Waiting for " in "".join(capsys.readouterr())
+
+
+def test_leftovers_of_a_killed_build_are_removed(toy):
+    before = tree_hash(toy / "book")
+    for path in ("plain.running.ipynb", "plain.running.log", "tmpabc.tmp", "../../_build/new/x"):
+        executed(toy, path).parent.mkdir(exist_ok=True)
+        executed(toy, path).write_text("half")
+    assert main([], toy) == 0
+    assert tree_hash(toy / "book") == before
+
+
+@pytest.mark.parametrize("name", ["plain.ipynb", "plain.json"])
+@pytest.mark.parametrize("place", [0.3, 0.9])
+def test_damaged_copy_or_record_is_made_again(toy, name, place):
+    content = bytearray(executed(toy, name).read_bytes())
+    content[int(place * len(content))] ^= 1
+    executed(toy, name).write_bytes(content)
+    assert outdated(toy) == {"plain"}
+
+
+@pytest.mark.parametrize("record", ["", "[]", "3", "{}"])
+def test_record_of_another_type_counts_as_none(toy, record):
+    executed(toy, "plain.json").write_text(record)
+    assert outdated(toy) == {"plain"}
+
+
+def test_damaged_page_is_built_again(toy, capsys, monkeypatch):
+    def rebuilt(*folders: Path) -> None:
+        raise BuildError("rebuilt")
+
+    monkeypatch.setattr(website, "run_jupyter_book", rebuilt)
+    assert main([], toy) == 0
+    (toy / "book/_build/html/plain.html").write_text("half a page")
+    assert main([], toy) == 1
+    assert "rebuilt" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("in_one_step", [True, False])
+def test_folder_takes_the_place_of_another(tmp_path, monkeypatch, in_one_step):
+    if not in_one_step:
+        monkeypatch.setattr(website, "exchanged", lambda one, other: False)
+    for content in ("old", "new"):
+        (tmp_path / "made" / "_build").mkdir(parents=True, exist_ok=True)
+        (tmp_path / "made" / "_build" / "page").write_text(content)
+        website.replace_folder(tmp_path / "site", tmp_path / "made" / "_build")
+        assert (tmp_path / "site" / "page").read_text() == content
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["made", "site"]
+
+
 # -------------------------------------------------------------------------------- set-up
+
+
+def test_failed_set_up_leaves_no_stamp(tmp_path, monkeypatch):
+    def fail(*command) -> None:
+        sys.exit("failed")
+
+    monkeypatch.setattr(setup, "STAMP", tmp_path / "installed")
+    monkeypatch.setattr(setup, "run", fail)
+    setup.STAMP.write_text("of other pins")
+    with pytest.raises(SystemExit, match="failed"):
+        setup.install_environment()
+    assert not setup.STAMP.exists()
+
+
+def test_set_up_of_a_folder_that_cannot_be_written_says_so(tmp_path, monkeypatch):
+    monkeypatch.setattr(setup, "STAMP", tmp_path / "installed")
+    monkeypatch.setattr(setup.os, "access", lambda path, mode: False)
+    with pytest.raises(SystemExit, match="cannot be written"):
+        setup.install_environment()
+
+
+@pytest.mark.parametrize(
+    ("has_cpu_build", "locks", "said"),
+    [
+        (True, ["torch-cpu.txt"], "torch: the CPU build"),
+        (False, ["torch-cpu.txt", "torch.txt"], "the plain one is taken"),
+    ],
+)
+def test_torch_is_a_build_whose_hash_is_known(monkeypatch, capsys, has_cpu_build, locks, said):
+    commands = []
+    monkeypatch.setattr(setup, "succeeds", lambda *call: commands.append(call) or has_cpu_build)
+    monkeypatch.setattr(setup, "run", lambda *call: commands.append(call))
+    setup.install_torch()
+    assert [command[-1].name for command in commands] == locks
+    assert all("--require-hashes" in command for command in commands)
+    assert said in capsys.readouterr().out
 
 
 def test_missing_system_packages_are_named_and_never_fail(tmp_path):
     """Without apt-get and without the right to install: one command to type, and the loss."""
-    script = Path(__file__).resolve().parents[1] / "book" / "setup.py"
+    script = ROOT / "book" / "setup.py"
     code = f"import runpy; runpy.run_path({str(script)!r})['install_system_packages']()"
     done = subprocess.run(
         [sys.executable, "-c", code], env={"PATH": str(tmp_path)}, capture_output=True, text=True

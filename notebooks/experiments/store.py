@@ -142,7 +142,7 @@ class Store:
         if experiment.checkpoints is None:
             return
         runs = itertools.product(cells, seeds)
-        paths = [path for cell, seed in runs for path in experiment.checkpoints(cell, seed)]
+        paths = {path for cell, seed in runs for path in experiment.checkpoints(cell, seed)}
         if there := [path for path in paths if path.exists()]:
             self._read()
             for path in there:

@@ -199,7 +199,7 @@ def test_kill_loses_one_update_at_most(tmp_path):
     )
     process = subprocess.Popen([sys.executable, script], stderr=subprocess.DEVNULL)
     path = tmp_path / "c" / "ppo_0.checkpoint"
-    for _ in range(600):
+    for _ in range(2400):
         if previous(path).exists():
             break
         time.sleep(0.05)

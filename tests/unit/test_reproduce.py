@@ -23,7 +23,7 @@ def train(cell: Cell, seeds: list[int], policies: Path) -> pd.DataFrame:
     STATE["until"] -= 1
     rows = toy_experiment.run(cell, seeds)
     policies.mkdir(parents=True, exist_ok=True)
-    (policies / f"{cell.method}_{cell.size}").write_text(str(STATE["shift"]))
+    write_sealed(policies / f"{cell.method}_{cell.size}", str(STATE["shift"]).encode())
     return rows.assign(value=rows["value"] + STATE["shift"])
 
 
@@ -33,7 +33,7 @@ def policy(cell: Cell, seed: int, policies: Path) -> list[Path]:
 
 def play(cell: Cell, seeds: list[int], policies: Path) -> pd.DataFrame:
     rows = toy_experiment.run(cell, seeds)
-    return rows.assign(value=rows["value"] + float(policy(cell, 0, policies)[0].read_text()))
+    return rows.assign(value=rows["value"] + float(read_sealed(policy(cell, 0, policies)[0])))
 
 
 @pytest.fixture
@@ -137,7 +137,8 @@ def test_runs_of_a_chaotic_cell_are_alike_or_not(shift, expected):
 
 @pytest.mark.parametrize("name", [*confirm.CHAOTIC, "door/success", "door/strategies"])
 def test_shipped_cells_have_runs_enough_to_be_told_apart(name):
-    shipped = Store(registry.DATA / "results", name)
+    chapter, name = name.split("/")
+    shipped = Store(registry.DATA / "results" / chapter, name)
     columns = min(shipped.batches(), key=lambda batch: len(batch["seeds"]))["columns"]
     rows = select(shipped.rows(), columns)
     assert reproduce.alike(rows, rows)
