@@ -46,7 +46,7 @@ class Categorical:
     def sample(parameters: Tensor, generators: Generators) -> Tensor:
         uniform = np.stack([generator.random(parameters.shape[1]) for generator in generators])
         below = parameters.softmax(-1).cumsum(-1)[..., :-1]  # rounding must not lead too far
-        return (torch.tensor(uniform, dtype=below.dtype).unsqueeze(-1) > below).sum(-1)
+        return (torch.tensor(uniform).to(below).unsqueeze(-1) > below).sum(-1)
 
     @staticmethod
     def mode(parameters: Tensor) -> Tensor:
@@ -76,7 +76,7 @@ class Gaussian:
     def sample(parameters: Tensor, generators: Generators) -> Tensor:
         mean, deviation = parameters.chunk(2, -1)
         noise = [generator.standard_normal(mean.shape[1:]) for generator in generators]
-        return mean + deviation * torch.tensor(np.stack(noise), dtype=mean.dtype)
+        return mean + deviation * torch.tensor(np.stack(noise)).to(mean)
 
     @staticmethod
     def mode(parameters: Tensor) -> Tensor:

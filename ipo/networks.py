@@ -142,8 +142,10 @@ class DenseNetwork(Network):
     def frozen(self, players: Sequence[Weights]) -> Acting:
         """The average that acts, as a function of ``observations [R, B, O]``.
 
-        In NumPy: for the few rows of a step, torch would take five times as long.
+        In NumPy on the CPU: for the few rows of a step, torch would take five times as long.
         """
+        if next(iter(players[0].values())).device.type != "cpu":
+            return super().frozen(players)
         weights = [
             {name: w.detach().numpy().copy() for name, w in player.items()} for player in players
         ]
@@ -241,15 +243,16 @@ class OnTable:
     def __call__(self, weights: Weights, indices: Tensor) -> Outputs:
         """``indices [R, B]`` -> logits ``[R, B, A]``, values ``[R, B]``."""
         rows, position = _distinct(indices, len(self.table))
-        logits, values = self.network(weights, self.table[rows])
+        logits, values = self.network(weights, self.table.to(rows.device)[rows])
         return _take(logits, position), values.gather(1, position)
 
     def average(self, players: Sequence[Weights]) -> Outputs:
         """What the players' average makes of the whole table: ``[R, K, A]`` and ``[R, K]``."""
-        num_runs = next(iter(players[0].values())).shape[0]
+        weight = next(iter(players[0].values()))
         policy = self.network.frozen(players)
         # In pieces, which stay in the processor's cache.
-        pieces = [policy(x.expand(num_runs, *x.shape)) for x in self.table.split(PIECE)]
+        table = self.table.to(weight.device)
+        pieces = [policy(x.expand(len(weight), *x.shape)) for x in table.split(PIECE)]
         logits, values = zip(*pieces, strict=True)
         return torch.cat(logits, 1), torch.cat(values, 1)
 
@@ -274,7 +277,8 @@ class Tanh(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, x: Tensor) -> Tensor:
-        y = torch.from_numpy(np.tanh(x.detach().numpy()))
+        on_cpu = x.device.type == "cpu"
+        y = torch.from_numpy(np.tanh(x.detach().numpy())) if on_cpu else x.tanh()
         ctx.save_for_backward(y)
         return y
 
@@ -310,7 +314,7 @@ def _distinct(indices: Tensor, num_rows: int) -> tuple[Tensor, Tensor]:
 
     Runs with fewer than U rows are filled up with rows that nobody asks for.
     """
-    occurs = torch.zeros(len(indices), num_rows, dtype=torch.int64).scatter_(1, indices, 1)
+    occurs = indices.new_zeros(len(indices), num_rows).scatter_(1, indices, 1)
     num_distinct = int(occurs.sum(1).max())
     rows = occurs.argsort(dim=1, descending=True, stable=True)[:, :num_distinct]
     return rows, (occurs.cumsum(1) - 1).gather(1, indices)

@@ -86,6 +86,7 @@ def train_policy(
     settings: PPOSettings | None = None,
     network: Network | None = None,
     label: str | None = None,
+    device: str = "cpu",
     **changes: Any,
 ) -> Policy:
     """Train one policy for each seed by ``ppo``, ``ipo`` or ``ensemble``.
@@ -97,6 +98,7 @@ def train_policy(
         settings: instead of :func:`default_settings` of the method.
         network: instead of a :class:`ipo.networks.DenseNetwork` that fits the spaces.
         label: the method's name in rows; the method itself if none is given.
+        device: where networks learn, such as ``cuda``; the policy comes back to the CPU.
         changes: of the settings, such as ``num_updates=50``.
 
     Raises:
@@ -116,10 +118,11 @@ def train_policy(
     ) -> FromGymnasium:
         return _environments([makers[d] for d in np.repeat(chosen, num_copies)], generators)
 
-    training = Training(network, environments, len(makers), settings, list(seeds))
+    training = Training(network, environments, len(makers), settings, list(seeds), device)
     for _ in tqdm(range(settings.num_updates), desc=label or method, unit="update"):
         training.update()
-    return Policy(label or method, network, copied(training.players), tuple(seeds))
+    players = [{name: w.cpu() for name, w in own.items()} for own in copied(training.players)]
+    return Policy(label or method, network, players, tuple(seeds))
 
 
 def evaluate_policy(

@@ -138,12 +138,11 @@ class PPOSettings:
             )
         return size
 
-    def collector(self, environments: Environments) -> Collector:
+    def collector(self, environments: Environments, device: str = "cpu") -> Collector:
         """Of a player in its environments."""
         clip = self.reward_clip if self.normalize_rewards else None
-        return Collector(
-            environments, self.num_steps, self.discount, self.gae_lambda, self.time_outs, clip
-        )
+        sizes = self.num_steps, self.discount, self.gae_lambda
+        return Collector(environments, *sizes, self.time_outs, clip, device)
 
 
 class Training:
@@ -155,6 +154,7 @@ class Training:
         num_domains: training domains.
         settings: the method and how it is trained.
         seeds: R of them, one a run; every method draws the same streams from them.
+        device: where networks act and learn, such as ``cuda``; environments are on the CPU.
 
     Attributes:
         players: weights of every player; they change in place.
@@ -173,6 +173,7 @@ class Training:
         num_domains: int,
         settings: PPOSettings,
         seeds: Sequence[int],
+        device: str = "cpu",
     ) -> None:
         check_counts("seeds", seeds, minimum=0)
         owned = settings.domains_of_players(num_domains)
@@ -184,7 +185,8 @@ class Training:
             [np.random.default_rng(stream[i]) for stream in streams] for i in range(3)
         )
         self.network, self.settings, self.num_frames = network, settings, 0
-        self.players = [network.start(self.draws) for _ in owned]
+        starts = [network.start(self.draws) for _ in owned]
+        self.players = [{name: w.to(device) for name, w in own.items()} for own in starts]
         leaves = [[w.requires_grad_() for w in player.values()] for player in self.players]
         self.optimizers = [
             torch.optim.Adam(own, settings.learning_rate, eps=settings.adam_epsilon, fused=True)
@@ -194,7 +196,7 @@ class Training:
             make_environments(domains, own, self.resets)
             for domains, own in zip(owned, copies, strict=True)
         ]
-        self.collectors = [settings.collector(own) for own in environments]
+        self.collectors = [settings.collector(own, device) for own in environments]
 
     def reports(self) -> Iterator[tuple[int, list[Weights]]]:
         """Train to the end: ``(num_frames, players)`` now and after each update.
@@ -230,7 +232,7 @@ class Training:
         others = self._others(d, frames.observations)
         if settings.normalize_advantages == "rollout":
             frames = frames._replace(advantages=standardize(frames.advantages))
-        runs = torch.arange(len(frames.actions)).unsqueeze(1)
+        runs = torch.arange(len(frames.actions), device=frames.actions.device).unsqueeze(1)
         for epoch in range(settings.num_epochs):
             skip = settings.skip_last_frames and epoch % 2 == 1
             for chosen in minibatches(frames, settings, self.orders, skip):
@@ -301,6 +303,7 @@ def minibatches(
     if skip_last_frames:
         numbers = numbers[(numbers + 1) % settings.num_steps != 0]
     order = torch.tensor(np.stack([generator.permutation(numbers) for generator in generators]))
+    order = order.to(frames.actions.device)
     yield from order.split(settings.size_of_minibatches(frames.actions.shape[1]), dim=1)
 
 

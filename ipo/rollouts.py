@@ -113,6 +113,9 @@ class RewardNormalizer:
 
     def __call__(self, rewards: Tensor, ended: Tensor) -> Tensor:
         """``rewards [R, N, T]`` of the next T steps, and where episodes end -> scaled rewards."""
+        self.discounted, self.moments = (
+            x.to(rewards.device) for x in (self.discounted, self.moments)
+        )
         goes_on = (~ended).double().unbind(-1)
         discounted = []
         for reward, on in zip(rewards.double().unbind(-1), goes_on, strict=True):
@@ -153,6 +156,7 @@ class Collector:
         gae_lambda: lambda of the advantage estimate.
         time_outs: see :class:`ipo.ppo.PPOSettings`.
         reward_clip: bound on normalised rewards; ``None``: they are not normalised.
+        device: of the policy and the rollouts; environments and their answers are on the CPU.
     """
 
     environments: Environments
@@ -161,9 +165,10 @@ class Collector:
     gae_lambda: float
     time_outs: str = "bootstrap"
     reward_clip: float | None = None
+    device: str = "cpu"
 
     def __post_init__(self) -> None:
-        self.observation = self.environments.reset()
+        self.observation = self.environments.reset().to(self.device)
         self.normalizer = None
         if self.reward_clip is not None:
             num_runs, num_copies = self.observation.shape[:2]
@@ -196,7 +201,8 @@ class Collector:
         observation = self.observation
         parameters, values = policy(observation)
         actions = distribution.sample(parameters, generators)
-        step = self.environments.step(actions)
+        answer = self.environments.step(actions.cpu())
+        step = Step(*(x.to(self.device) for x in answer))
         self.observation = step.observation
         beyond = torch.zeros_like(values)
         timed_out = step.truncated & ~step.terminated
@@ -218,7 +224,7 @@ class Collector:
 
     def restore(self, state: dict[str, Any]) -> None:
         self.environments.restore(state["environments"])  # type: ignore[attr-defined]
-        self.observation = state["observation"]
+        self.observation = state["observation"].to(self.device)
         if self.normalizer is not None:
             self.normalizer.discounted, self.normalizer.moments = state["scale"]
 
