@@ -11,6 +11,7 @@ from toy_experiment import CELLS, Cell
 
 from experiments import confirm, registry, reproduce
 from experiments.experiment import Experiment, Places
+from experiments.sealed import read_sealed, write_sealed
 from experiments.store import Store, select
 
 STATE = {"shift": 0.0, "until": sys.maxsize}
@@ -22,7 +23,6 @@ def train(cell: Cell, seeds: list[int], policies: Path) -> pd.DataFrame:
         raise KeyboardInterrupt
     STATE["until"] -= 1
     rows = toy_experiment.run(cell, seeds)
-    policies.mkdir(parents=True, exist_ok=True)
     write_sealed(policies / f"{cell.method}_{cell.size}", str(STATE["shift"]).encode())
     return rows.assign(value=rows["value"] + STATE["shift"])
 
