@@ -8,7 +8,7 @@ import nbformat
 import pytest
 import yaml
 
-from execute import DATA, tree_hash
+from chapters import DATA, tree_hash
 
 ROOT = Path(__file__).resolve().parents[2]
 NAMES = [path.stem for path in sorted((ROOT / "notebooks").glob("*.ipynb"))]

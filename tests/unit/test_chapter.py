@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from execute import DATA, tree_hash
+from chapters import DATA, tree_hash
 from experiments import keys
 from experiments.chapter import Chapter
 
