@@ -42,8 +42,7 @@ def reproduce(
 ) -> pd.DataFrame:
     """Compute what is not reproduced yet, on all cores or by a dask scheduler.
 
-    Returns:
-        a row for every experiment: its cells, and how many of them came out how.
+    Returns a row for every experiment: its cells, and how many of them came out how.
     """
     waves = recorded(chapters)
     costs = [[cost(part) for part in wave if lacking(part)] for wave in waves]
