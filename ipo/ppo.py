@@ -163,7 +163,8 @@ class Training:
 
     Raises:
         ValueError: ``num_envs`` that cannot be split evenly among players and domains, a
-            minibatch larger than a player's rollout, seeds that are no different whole numbers.
+            minibatch larger than a player's rollout, seeds that are no different whole numbers,
+            a device that is not there.
     """
 
     def __init__(
@@ -176,6 +177,7 @@ class Training:
         device: str = "cpu",
     ) -> None:
         check_counts("seeds", seeds, minimum=0)
+        check_device(device)
         owned = settings.domains_of_players(num_domains)
         copies = settings.copies_of_players(num_domains)
         for own in copies:
@@ -293,6 +295,14 @@ class Training:
 
     def _generators(self) -> list[np.random.Generator]:
         return [*self.draws, *self.resets, *self.orders]
+
+
+def check_device(device: str) -> None:
+    """Torch has several errors for a device that it cannot use."""
+    try:
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError, ImportError) as error:
+        raise ValueError(f"device = {device!r}: must be one that torch can use: {error}") from error
 
 
 def minibatches(

@@ -40,7 +40,10 @@ OUTCOMES = ("exact", "close", "alike", "differs")
 def reproduce(
     chapters: Sequence[str] = (), num_workers: int = -1, scheduler: str | None = None
 ) -> pd.DataFrame:
-    """Compute what is not reproduced yet; returns :func:`comparison` of all."""
+    """Compute what is not reproduced yet, on all cores or by a dask scheduler.
+
+    Returns a row for every experiment: its cells, and how many of them came out how.
+    """
     waves = recorded(chapters)
     costs = [[cost(part) for part in wave if lacking(part)] for wave in waves]
     total, left = sum(cost(part) for wave in waves for part in wave), sum(map(sum, costs))

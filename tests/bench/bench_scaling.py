@@ -23,7 +23,7 @@ from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-import torch
+from threadpoolctl import threadpool_limits
 
 from experiments.doors.training import CELLS, shorter
 from experiments.experiment import Cell, Places
@@ -52,7 +52,8 @@ def seconds(name: str, cell: Cell, num_runs: int, folder: Path, number: int = 0)
     chapter, experiment = name.split("/")
     places = Places(folder / "tables", folder / "policies", folder / f"checkpoints_{number}")
     run = CHAPTERS[chapter][experiment].at(places).run
-    return timed(run, cell, list(range(num_runs)))[2]["cpu_seconds"]
+    with threadpool_limits(1):  # as in the workers, where this process computes alone
+        return timed(run, cell, list(range(num_runs)))[2]["cpu_seconds"]
 
 
 def sweep(num_workers: int, folder: Path) -> dict[str, float]:
@@ -82,7 +83,6 @@ def main() -> None:
     if options.rounds < 1:
         parser.error("must be: --rounds >= 1")
 
-    torch.set_num_threads(1)
     rounds, gib = [], {}
     spawned = multiprocessing.get_context("spawn")
     with TemporaryDirectory() as scratch:

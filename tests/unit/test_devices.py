@@ -97,6 +97,12 @@ def test_training_is_the_same_on_another_device(task, device, monkeypatch):
         torch.testing.assert_close(other, one, rtol=tolerance, atol=tolerance)
 
 
+@pytest.mark.parametrize("device", ["gpu", "lazy"])
+def test_a_device_that_is_not_there_is_named(device):
+    with pytest.raises(ValueError, match=f"device = '{device}': must be one that torch can use: "):
+        trained("numbers", device)
+
+
 def test_a_tensor_that_does_not_follow_is_caught():
     with OtherDevice(), pytest.raises(RuntimeError, match=r"add\.Tensor: .* \(2,\) are on the CPU"):
         torch.ones(2) + torch.ones(2).to(DEVICE)
