@@ -23,7 +23,7 @@ import scipy.linalg
 import torch
 from torch import Tensor
 
-from ipo.checks import Count, Natural, Positive, Seeds, checked
+from ipo.checks import Count, Natural, Positive, Seeds, check_count, checked
 
 # A closed loop whose power 2^20 has not vanished counts as unstable: its spectral radius
 # is above 1 - 1e-5.
@@ -89,6 +89,7 @@ class LQR:
     @checked
     def run(self, r: Natural) -> LQR:
         """The problem of run r alone, still with a run axis."""
+        check_count("r", r, 0, self.num_runs - 1)
         return self._map(lambda tensor: tensor[r : r + 1])
 
     def to(self, dtype: torch.dtype) -> LQR:
@@ -151,6 +152,7 @@ def random_orthogonal(
     uniform [0, 1) entries. They depend on the matrix' first columns only, so only these are
     factorised; all are drawn, because the published runs draw them.
     """
+    check_count("num_columns", num_columns, maximum=num_rows)
     entries = random.rand(num_rows, num_rows)[:, :num_columns]
     orthonormal, triangular = np.linalg.qr(entries)
     return orthonormal * np.sign(np.diag(triangular))

@@ -255,6 +255,7 @@ class OnTable:
 
     def average(self, players: Sequence[Weights]) -> Outputs:
         """What the players' average makes of the whole table: ``[R, K, A]`` and ``[R, K]``."""
+        self.network._check(players)
         num_runs = next(iter(players[0].values())).shape[0]
         policy = self.network.frozen(players)
         # In pieces, which stay in the processor's cache.

@@ -76,7 +76,7 @@ class PPOSettings:
     learning_rate: Positive = 1e-3
     adam_epsilon: Positive = 1e-8
     num_updates: Count = 20
-    num_envs: Count | tuple[Count, ...] = 48
+    num_envs: Count | Annotated[tuple[Count, ...], "domains"] = 48
     num_steps: Count = 128
     num_epochs: Count = 4
     minibatch_size: Count = 256

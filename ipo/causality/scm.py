@@ -194,7 +194,7 @@ def moments(model: SCM) -> tuple[pd.Series, pd.DataFrame]:
     for name, assignment in model.assignments.items():
         if not isinstance(assignment, Linear):
             raise TypeError(
-                f"{name}: is a {type(assignment).__name__}, must be Linear for exact moments"
+                f"model: {name} is a {type(assignment).__name__}, must be Linear for exact moments"
             )
         for parent, coefficient in assignment.coefficients.items():
             B.loc[name, parent] = coefficient

@@ -20,7 +20,7 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import joblib
 import pandas as pd
@@ -30,12 +30,19 @@ from tqdm import tqdm
 from experiments import origin
 from experiments.experiment import Cell, Experiment, rebuilt
 from experiments.files import replace_text
-from ipo.checks import check_counts
+from ipo.checks import Seeds, check_count, checked
 
 KEYS = {"columns", "cell", "run", "options", "seeds", "reads", "num_rows", "sha256"}  # of a batch
 NO_ROWS = pd.DataFrame({"run": pd.Series(dtype=int)})
 
 Batch = dict[str, Any]
+
+
+def _check_workers(name: str, value: object) -> None:
+    """As joblib counts them: -1 are as many as there are cores."""
+    check_count(name, value, minimum=None)
+    if value == 0:
+        raise ValueError(f"{name} = 0: must be a number of processes, or -1 for one per core")
 
 
 class ResultsError(ValueError):
@@ -82,12 +89,13 @@ class Store:
         rows = self.rows()
         return select(rows[rows["run"].isin(batch["seeds"])], batch["columns"])
 
+    @checked
     def fill(
         self,
         experiment: Experiment,
-        cells: Sequence[Cell],
-        seeds: Sequence[int],
-        num_workers: int | None = None,
+        cells: Annotated[Sequence[Cell], "cells"],
+        seeds: Seeds,
+        num_workers: Annotated[int, _check_workers] | None = None,
     ) -> pd.DataFrame:
         """The rows of ``cells`` x ``seeds``: loaded where they exist, computed where they do not.
 
@@ -104,7 +112,6 @@ class Store:
             ResultsError: files that are damaged, or a folder that cannot be written.
             OriginError: rows of another cell, option, run function or input than asked for.
         """
-        check_counts("seeds", seeds, minimum=0)
         rows, batches = self._read()
         for cell in cells:
             for batch in batches:

@@ -20,6 +20,7 @@ from tqdm import tqdm
 from experiments.checkpoints import CheckpointError, load_checkpoint, save_checkpoint
 from experiments.experiment import Experiment
 from experiments.policies import load_policy, save_policy
+from ipo.checks import Count, checked
 from ipo.distributions import Gaussian
 from ipo.networks import DenseNetwork, Weights, copied
 from ipo.ppo import PPOSettings, Training
@@ -57,6 +58,7 @@ def published_door(method: str, **changes: Any) -> PPOSettings:
     return PPOSettings(method, **(paper | changes))
 
 
+@checked
 @dataclass(frozen=True)
 class Cell:
     """One configuration of the training.
@@ -71,8 +73,8 @@ class Cell:
 
     label: str
     settings: PPOSettings
-    saved_after: tuple[int, ...] = (95, 190)
-    curve_every: int = 10
+    saved_after: tuple[Count, ...] = (95, 190)
+    curve_every: Count = 10
 
     def __post_init__(self) -> None:
         for updates in self.saved_after:
