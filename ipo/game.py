@@ -22,7 +22,7 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-from ipo.checks import Count, Positive, checked, one_of
+from ipo.checks import Count, Positive, check_count, checked, one_of
 from ipo.optimizers import descend
 
 OWNERSHIPS = ("pooled", "ipo", "ensemble")
@@ -49,11 +49,10 @@ def domains_of_players(
     }[method]
 
 
-@checked
 def play_round(
-    num_players: Count,
+    num_players: int,
     respond: Callable[[int], None],
-    num_inner_rounds: Count = 1,
+    num_inner_rounds: int = 1,
     move_phi: Callable[[], None] | None = None,
 ) -> None:
     """One iteration of Algorithm 1, whatever the players are made of.
@@ -65,6 +64,8 @@ def play_round(
         move_phi: lets the part that all players share make its move on the cost of all domains;
             ``None``: Phi is fixed.
     """
+    check_count("num_players", num_players)
+    check_count("num_inner_rounds", num_inner_rounds)
     if move_phi is not None:  # lines 2 to 6
         move_phi()
     for _ in range(num_inner_rounds):  # line 7

@@ -174,15 +174,21 @@ def expected_cost(K: Gains, problem: LQR, W: Observation) -> Tensor:
         ``[R]``, differentiable; ``inf`` where the closed loop is unstable: the equation then
         still has a solution, but a meaningless one.
     """
-    return _StateFeedbackCost.apply(K @ W, problem.A, problem.B, problem.Q, problem.R)
+    return feedback_costs(K @ W, problem)
 
 
 @checked
 def training_costs(K: Gains, problem: LQR) -> Tensor:
     """:func:`expected_cost` of gains ``[R, n_u, n_o]`` in every training domain, ``[R, E]``."""
-    F = split_domains(K @ problem.seen, problem.num_domains)
-    systems = (problem.A, problem.B, problem.Q, problem.R)
-    return _StateFeedbackCost.apply(F, *(matrix.unsqueeze(1) for matrix in systems))
+    return feedback_costs(split_domains(K @ problem.seen, problem.num_domains), problem)
+
+
+def feedback_costs(F: Tensor, problem: LQR) -> Tensor:
+    """The cost of ``a = -F s``, F ``[R, n_u, n_x]`` or ``[R, E, n_u, n_x]``; unchecked, for loops."""
+    systems = [problem.A, problem.B, problem.Q, problem.R]
+    if F.dim() == 4:
+        systems = [matrix.unsqueeze(1) for matrix in systems]
+    return _StateFeedbackCost.apply(F, *systems)
 
 
 class _StateFeedbackCost(torch.autograd.Function):

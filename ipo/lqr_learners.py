@@ -25,7 +25,7 @@ from ipo.checks import (
     one_of,
 )
 from ipo.game import LinearPlayers, play_round
-from ipo.lqr import LQR, Gains, expected_cost, spectral_radius, split_domains, training_costs
+from ipo.lqr import LQR, Gains, feedback_costs, spectral_radius, split_domains, training_costs
 from ipo.optimizers import OPTIMIZERS, descend, make_optimizer
 
 LQR_METHODS = ("gradient_descent", "overparameterized", "ipo_fixed_phi", "ipo_variable_phi")
@@ -85,7 +85,7 @@ def gradient_descent(
     """One player that owns all domains: gradient descent on the pooled cost of K."""
     player = _players(settings, start, num_players=1)
     return Learner(
-        iterate=lambda: player.round([lambda K: training_costs(K, problem).mean(1)]),
+        iterate=lambda: player.round([lambda K: _pooled_cost(K, problem)]),
         gain=lambda: player.policy,
     )
 
@@ -101,7 +101,7 @@ def overparameterized(
     def respond(_: int) -> None:
         descend(
             optimizer,
-            lambda: training_costs(K @ Phi, problem).mean(1),
+            lambda: _pooled_cost(K @ Phi, problem),
             settings.max_gradient_norm,
         )
 
@@ -118,7 +118,7 @@ def ipo_fixed_phi(
     """A player per domain, each with a whole controller; their average acts (Phi = identity)."""
     players = _players(settings, start, problem.num_domains)
     observations = [W.contiguous() for W in problem.W_train.unbind(1)]  # twice as fast
-    costs = [lambda K, W=W: expected_cost(K, problem, W) for W in observations]
+    costs = [lambda K, W=W: feedback_costs(K @ W, problem) for W in observations]
     return Learner(
         iterate=lambda: players.round(costs),
         gain=lambda: players.policy,
@@ -138,14 +138,14 @@ def ipo_variable_phi(
     def move_phi() -> None:
         descend(
             optimizer,
-            lambda: training_costs(players.policy @ Phi, problem).mean(1),
+            lambda: _pooled_cost(players.policy @ Phi, problem),
             settings.max_gradient_norm,
         )
         seen = split_domains(Phi.detach() @ problem.seen, problem.num_domains)
         features[:] = seen.unbind(1)
 
     costs = [
-        lambda K, d=d: expected_cost(K, problem, features[d]) for d in range(problem.num_domains)
+        lambda K, d=d: feedback_costs(K @ features[d], problem) for d in range(problem.num_domains)
     ]
     return Learner(
         iterate=lambda: players.round(costs, move_phi=move_phi),
@@ -202,6 +202,12 @@ def train(
         if iteration < settings.num_iterations:
             for learner in learners:
                 learner.iterate()
+
+
+def _pooled_cost(K: Tensor, problem: LQR) -> Tensor:
+    """Of all training domains, ``[R]``."""
+    F = split_domains(K @ problem.seen, problem.num_domains)
+    return feedback_costs(F, problem).mean(1)
 
 
 def _players(settings: LQRSettings, start: Tensor, num_players: int) -> LinearPlayers:

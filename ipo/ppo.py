@@ -117,9 +117,9 @@ class PPOSettings:
                 )
         return [[of_domain[domain] // num_owners for domain in domains] for domains in owned]
 
-    @checked
-    def size_of_minibatches(self, num_frames: Count) -> int:
+    def size_of_minibatches(self, num_frames: int) -> int:
         """Of a rollout with ``num_frames``."""
+        check_count("num_frames", num_frames)
         if self.num_minibatches is not None:
             name, size = "num_minibatches", num_frames // self.num_minibatches
         else:

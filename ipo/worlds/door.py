@@ -361,7 +361,6 @@ def observe(
     return observation, reward(qpos[..., 6], distance, R)
 
 
-@checked
 def lever(params: DoorParams, handle_shift: Shift) -> tuple[np.ndarray, np.ndarray]:
     """The hinge's position at the handle's height, and the arm from there to the target."""
     to_hinge = np.array([0.0, params.lever_arm, 0.0])
@@ -370,14 +369,12 @@ def lever(params: DoorParams, handle_shift: Shift) -> tuple[np.ndarray, np.ndarr
     return params.position + to_hinge, arm
 
 
-@checked
 def draw_start(generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """How an episode begins: joints ``[7]`` at rest, and the handle's shift ``[2]``."""
     start = generator.uniform(START_LOW, START_HIGH)
     return np.append(start[:6], 0.0), start[6:]
 
 
-@checked
 def shift_handle(model: mujoco.MjModel, params: DoorParams, handle_shift: Shift) -> None:
     """Put a compiled door's handle in its place for an episode."""
     model.body("handle").pos = params.handle_position + np.array([0.0, *handle_shift])
