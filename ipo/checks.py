@@ -13,11 +13,9 @@ from what was.
 
 from __future__ import annotations
 
-import ast
 import difflib
 import functools
 import inspect
-import itertools
 import math
 import operator
 import reprlib
@@ -236,33 +234,3 @@ def _check_one_of(name: str, value: object, rules: Sequence[Any], sizes: dict[st
         except (TypeError, ValueError) as error:
             errors.append(error)
     raise min(errors, key=lambda error: isinstance(error, TypeError))
-
-
-def check_notebook_parameters(executed: Sequence[str]) -> None:
-    """Refuse a misspelt parameter of a notebook that papermill runs.
-
-    ``executed`` is IPython's ``In``: the sources of the cells run so far. Papermill puts the
-    values it was given in a cell of their own, which starts with ``# Parameters``, right
-    after the cell with the defaults, and only warns of a name that the defaults do not have.
-    """
-    cells = [cell for cell in executed if cell.strip()]
-    for defaults, injected in itertools.pairwise(cells):
-        if injected.startswith("# Parameters\n"):
-            known = _assigned_names(defaults)
-            for name, value in _assigned_names(injected).items():
-                if name not in known:
-                    nearest = difflib.get_close_matches(name, known, n=1)
-                    hint = f"; did you mean {nearest[0]!r}?" if nearest else ""
-                    raise ValueError(
-                        f"{name} = {value}: this notebook has no such parameter; "
-                        f"it has {', '.join(known)}{hint}"
-                    )
-
-
-def _assigned_names(source: str) -> dict[str, str]:
-    """Names that a cell assigns, with the text of their values."""
-    return {
-        node.targets[0].id: ast.unparse(node.value)
-        for node in ast.parse(source).body
-        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name)
-    }

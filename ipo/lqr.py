@@ -184,7 +184,7 @@ def training_costs(K: Gains, problem: LQR) -> Tensor:
 
 
 def feedback_costs(F: Tensor, problem: LQR) -> Tensor:
-    """The cost of ``a = -F s``, F ``[R, n_u, n_x]`` or ``[R, E, n_u, n_x]``; unchecked, for loops."""
+    """The cost of ``a = -F s``, F ``[R, n_u, n_x]`` or ``[R, E, n_u, n_x]``; unchecked."""
     systems = [problem.A, problem.B, problem.Q, problem.R]
     if F.dim() == 4:
         systems = [matrix.unsqueeze(1) for matrix in systems]

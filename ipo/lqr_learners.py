@@ -99,11 +99,7 @@ def overparameterized(
     optimizer = _optimizer(settings, [Phi, K])
 
     def respond(_: int) -> None:
-        descend(
-            optimizer,
-            lambda: _pooled_cost(K @ Phi, problem),
-            settings.max_gradient_norm,
-        )
+        descend(optimizer, lambda: _pooled_cost(K @ Phi, problem), settings.max_gradient_norm)
 
     return Learner(
         iterate=lambda: play_round(1, respond),
