@@ -17,27 +17,30 @@ Source: Algorithm 1 of Sonar, Pacelli and Majumdar (2021), after Ahuja et al. (2
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Annotated
 
 import torch
 from torch import Tensor
 
-from ipo.checks import check_choice, check_count
+from ipo.checks import Count, Positive, check_count, checked, one_of
 from ipo.optimizers import descend
 
 OWNERSHIPS = ("pooled", "ipo", "ensemble")
 ORDERS = ("in_turn", "together")
+Order = Annotated[str, one_of(ORDERS)]
 
 Cost = Callable[[Tensor], Tensor]  # policy [R, ...] -> [R]
 
 
-def domains_of_players(method: str, num_domains: int) -> list[list[int]]:
+@checked
+def domains_of_players(
+    method: Annotated[str, one_of(OWNERSHIPS)], num_domains: Count
+) -> list[list[int]]:
     """The domains that each player owns.
 
     ``pooled`` is one player that owns all; in ``ipo`` each domain has a player of its own; an
     ``ensemble`` has as many players as ``ipo``, and each owns all domains.
     """
-    check_choice("method", method, OWNERSHIPS)
-    check_count("num_domains", num_domains)
     everything = list(range(num_domains))
     return {
         "pooled": [everything],
@@ -61,6 +64,8 @@ def play_round(
         move_phi: lets the part that all players share make its move on the cost of all domains;
             ``None``: Phi is fixed.
     """
+    check_count("num_players", num_players)
+    check_count("num_inner_rounds", num_inner_rounds)
     if move_phi is not None:  # lines 2 to 6
         move_phi()
     for _ in range(num_inner_rounds):  # line 7
@@ -98,15 +103,15 @@ class LinearPlayers:
         policy: their average ``[R, ...]``, which acts; it changes in place.
     """
 
+    @checked
     def __init__(
         self,
-        starts: Tensor,
+        starts: Annotated[Tensor, "R E ..."],
         optimizer: Callable[[Sequence[Tensor]], torch.optim.Optimizer],
-        bound: float | None = None,
-        max_gradient_norm: float | None = None,
-        order: str = "in_turn",
+        bound: Positive | None = None,
+        max_gradient_norm: Positive | None = None,
+        order: Order = "in_turn",
     ) -> None:
-        check_choice("order", order, ORDERS)
         # One contiguous block for each player: its optimiser updates it at full speed.
         self.players = [
             start.clone(memory_format=torch.contiguous_format).requires_grad_()
@@ -128,6 +133,8 @@ class LinearPlayers:
         move_phi: Callable[[], None] | None = None,
     ) -> None:
         """One iteration of Algorithm 1, where player d wants ``costs[d](policy)`` to be low."""
+        if len(costs) != len(self.players):
+            raise ValueError(f"costs: are {len(costs)}, must be one for each player")
         move = self._move_in_turn if self.order == "in_turn" else self._move_together
         play_round(len(self.players), lambda d: move(d, costs[d]), num_inner_rounds, move_phi)
 
@@ -153,7 +160,8 @@ class LinearPlayers:
             self.players[d].detach().clamp_(-self.bound, self.bound)
 
 
-def nash_gap(costs: Tensor, best_costs: Tensor) -> Tensor:
+@checked
+def nash_gap(costs: Annotated[Tensor, "R E"], best_costs: Annotated[Tensor, "R E"]) -> Tensor:
     """How much the player who could gain most would gain by moving alone.
 
         gap = max_d [ J_d(pi_av) - min over pi_d of J_d(pi_av) ]

@@ -14,22 +14,26 @@ Tensors have the leading axes runs R and, where they differ by domain, domains E
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import scipy.linalg
 import torch
 from torch import Tensor
 
-from ipo.checks import check_count, check_counts, check_number
+from ipo.checks import Count, Natural, Positive, Seeds, check_count, checked
 
 # A closed loop whose power 2^20 has not vanished counts as unstable: its spectral radius
 # is above 1 - 1e-5.
 MAX_DOUBLINGS = 20
 
+Gains = Annotated[Tensor, "R n_u n_o"]
+Observation = Annotated[Tensor, "R n_o n_x"]  # of a domain
 
+
+@checked
 @dataclass(frozen=True)
 class LQR:
     """A stack of R independent problems that share their sizes.
@@ -44,12 +48,22 @@ class LQR:
         W_test: observation of the test domain ``[R, n_o, n_x]``.
     """
 
-    A: Tensor
-    B: Tensor
-    Q: Tensor
-    R: Tensor
-    seen: Tensor
-    W_test: Tensor
+    A: Annotated[Tensor, "R n_x n_x"]
+    B: Annotated[Tensor, "R n_x n_u"]
+    Q: Annotated[Tensor, "R n_x n_x"]
+    R: Annotated[Tensor, "R n_u n_u"]
+    seen: Annotated[Tensor, "R n_o columns"]
+    W_test: Annotated[Tensor, "R n_o n_x"]
+
+    def __post_init__(self) -> None:
+        num_columns, n_x = self.seen.shape[-1], self.A.shape[-1]
+        if num_columns % n_x:
+            raise ValueError(f"seen: has {num_columns} columns, must have a multiple of {n_x}")
+
+    @property
+    def sizes(self) -> dict[str, Any]:
+        (R, n_x, n_u), n_o = self.B.shape, self.seen.shape[1]
+        return {"R": R, "n_x": n_x, "n_u": n_u, "n_o": n_o, "dtype": self.A.dtype}
 
     @property
     def num_runs(self) -> int:
@@ -72,20 +86,23 @@ class LQR:
     def _map(self, change: Callable[[Tensor], Tensor]) -> LQR:
         return replace(self, **{name: change(getattr(self, name)) for name in vars(self)})
 
-    def run(self, r: int) -> LQR:
+    @checked
+    def run(self, r: Natural) -> LQR:
         """The problem of run r alone, still with a run axis."""
+        check_count("r", r, 0, self.num_runs - 1)
         return self._map(lambda tensor: tensor[r : r + 1])
 
     def to(self, dtype: torch.dtype) -> LQR:
         return self._map(lambda tensor: tensor.to(dtype))
 
 
+@checked
 def sample_problem(
-    seeds: Sequence[int],
-    num_domains: int,
-    dim_distractor: int,
-    dim_state: int = 20,
-    contraction: float = 0.99,
+    seeds: Seeds,
+    num_domains: Count,
+    dim_distractor: Count,
+    dim_state: Count = 20,
+    contraction: Positive = 0.99,
     dtype: torch.dtype = torch.float32,
 ) -> LQR:
     """The paper's random problems, one per seed: ``B = Q = R = I``, one test domain.
@@ -99,16 +116,11 @@ def sample_problem(
     Raises:
         TypeError, ValueError: see the rules below; nothing has been drawn by then.
     """
-    check_counts("seeds", seeds, minimum=0)
-    check_count("num_domains", num_domains)
-    check_count("dim_state", dim_state)
-    check_count("dim_distractor", dim_distractor)
     if dim_distractor < dim_state:
         raise ValueError(
             f"dim_distractor = {dim_distractor}: must be at least dim_state = {dim_state}, "
             "or W_d cannot be semi-orthogonal"
         )
-    check_number("contraction", contraction, above=0)
 
     def draw(seed: int) -> tuple[np.ndarray, np.ndarray]:
         random = np.random.RandomState(seed)
@@ -130,19 +142,24 @@ def split_domains(matrix: Tensor, num_domains: int) -> Tensor:
     return matrix.unflatten(-1, (num_domains, -1)).transpose(1, 2)
 
 
-def random_orthogonal(random: np.random.RandomState, num_rows: int, num_columns: int) -> np.ndarray:
+@checked
+def random_orthogonal(
+    random: np.random.RandomState, num_rows: Count, num_columns: Count
+) -> np.ndarray:
     """A random matrix with orthonormal columns, ``[num_rows, num_columns]``.
 
     The first columns of the QR factor ``Q diag(sign(diag(R)))`` of a square matrix with
     uniform [0, 1) entries. They depend on the matrix' first columns only, so only these are
     factorised; all are drawn, because the published runs draw them.
     """
+    check_count("num_columns", num_columns, maximum=num_rows)
     entries = random.rand(num_rows, num_rows)[:, :num_columns]
     orthonormal, triangular = np.linalg.qr(entries)
     return orthonormal * np.sign(np.diag(triangular))
 
 
-def expected_cost(K: Tensor, problem: LQR, W: Tensor) -> Tensor:
+@checked
+def expected_cost(K: Gains, problem: LQR, W: Observation) -> Tensor:
     """Expected infinite-horizon cost of ``a = -K o`` in the domain with observation ``W``.
 
     With ``s[0] ~ N(0, I)`` it is ``tr P``, where P solves
@@ -157,14 +174,21 @@ def expected_cost(K: Tensor, problem: LQR, W: Tensor) -> Tensor:
         ``[R]``, differentiable; ``inf`` where the closed loop is unstable: the equation then
         still has a solution, but a meaningless one.
     """
-    return _StateFeedbackCost.apply(K @ W, problem.A, problem.B, problem.Q, problem.R)
+    return feedback_costs(K @ W, problem)
 
 
-def training_costs(K: Tensor, problem: LQR) -> Tensor:
+@checked
+def training_costs(K: Gains, problem: LQR) -> Tensor:
     """:func:`expected_cost` of gains ``[R, n_u, n_o]`` in every training domain, ``[R, E]``."""
-    F = split_domains(K @ problem.seen, problem.num_domains)
-    systems = (problem.A, problem.B, problem.Q, problem.R)
-    return _StateFeedbackCost.apply(F, *(matrix.unsqueeze(1) for matrix in systems))
+    return feedback_costs(split_domains(K @ problem.seen, problem.num_domains), problem)
+
+
+def feedback_costs(F: Tensor, problem: LQR) -> Tensor:
+    """The cost of ``a = -F s``, F ``[R, n_u, n_x]`` or ``[R, E, n_u, n_x]``; unchecked."""
+    systems = [problem.A, problem.B, problem.Q, problem.R]
+    if F.dim() == 4:
+        systems = [matrix.unsqueeze(1) for matrix in systems]
+    return _StateFeedbackCost.apply(F, *systems)
 
 
 class _StateFeedbackCost(torch.autograd.Function):
@@ -220,12 +244,14 @@ def _lyapunov_pair(M: Tensor, C: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return P, S, stable
 
 
-def spectral_radius(K: Tensor, problem: LQR, W: Tensor) -> Tensor:
+@checked
+def spectral_radius(K: Gains, problem: LQR, W: Observation) -> Tensor:
     """Largest absolute eigenvalue ``[R]`` of the closed loop ``A - B K W``; stable below 1."""
     M = problem.A - problem.B @ K @ W
     return torch.linalg.eigvals(M.double()).abs().amax(-1)
 
 
+@checked
 def riccati_gain(problem: LQR) -> tuple[Tensor, Tensor]:
     """The oracle, which sees the state: its gain ``F* [R, n_u, n_x]`` and cost ``[R]``.
 
@@ -246,7 +272,8 @@ def riccati_gain(problem: LQR) -> tuple[Tensor, Tensor]:
     return gains.to(problem.A), costs.to(problem.A)
 
 
-def oracle_cost(dim_state: int = 20, contraction: float = 0.99) -> float:
+@checked
+def oracle_cost(dim_state: Count = 20, contraction: Positive = 0.99) -> float:
     """The oracle's cost in closed form for the paper's problem.
 
     With ``B = Q = R = I`` and ``A = c`` times an orthogonal matrix, ``P* = p I`` with
@@ -257,6 +284,7 @@ def oracle_cost(dim_state: int = 20, contraction: float = 0.99) -> float:
     return dim_state * (c2 + math.sqrt(c2**2 + 4)) / 2
 
 
+@checked
 def row_space(problem: LQR) -> Tensor:
     """Orthonormal basis ``[R, n_o, rank]`` of the observations that training can show.
 
@@ -268,11 +296,13 @@ def row_space(problem: LQR) -> Tensor:
     return basis[..., :rank].to(problem.A)
 
 
-def project(K: Tensor, basis: Tensor) -> Tensor:
+@checked
+def project(K: Gains, basis: Annotated[Tensor, "R n_o rank"]) -> Tensor:
     """The part of gains ``[R, n_u, n_o]`` inside the span of ``basis [R, n_o, rank]``."""
     return (K @ basis) @ basis.mT
 
 
+@checked
 def minimum_norm_gain(problem: LQR) -> Tensor:
     """The smallest gain ``[R, n_u, n_o]`` that is optimal in every training domain.
 
@@ -285,6 +315,7 @@ def minimum_norm_gain(problem: LQR) -> Tensor:
     return (targets @ torch.linalg.pinv(problem.seen.double())).to(problem.A)
 
 
+@checked
 def invariant_gain(problem: LQR) -> Tensor:
     """The gain ``[F* W_c^-1, 0]``, ``[R, n_u, n_o]``: optimal in every domain there can be."""
     F, _ = riccati_gain(problem)
@@ -294,9 +325,11 @@ def invariant_gain(problem: LQR) -> Tensor:
     return K
 
 
-def simulate(K: Tensor, problem: LQR, W: Tensor, start: Tensor, num_steps: int) -> Tensor:
+@checked
+def simulate(
+    K: Gains, problem: LQR, W: Observation, start: Annotated[Tensor, "R n_x"], num_steps: Natural
+) -> Tensor:
     """States ``[R, num_steps + 1, n_x]`` of the closed loop from ``start [R, n_x]``."""
-    check_count("num_steps", num_steps, minimum=0)
     M = problem.A - problem.B @ K @ W
     states = [start]
     for _ in range(num_steps):

@@ -8,19 +8,31 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ipo.checks import check_choice, check_count, check_number
+from ipo.checks import (
+    Count,
+    Natural,
+    NonNegative,
+    Positive,
+    Seeds,
+    check_checkpoints,
+    checked,
+    one_of,
+)
 from ipo.game import LinearPlayers, play_round
-from ipo.lqr import LQR, expected_cost, spectral_radius, split_domains, training_costs
+from ipo.lqr import LQR, Gains, feedback_costs, spectral_radius, split_domains, training_costs
 from ipo.optimizers import OPTIMIZERS, descend, make_optimizer
 
 LQR_METHODS = ("gradient_descent", "overparameterized", "ipo_fixed_phi", "ipo_variable_phi")
+Method = Annotated[str, one_of(LQR_METHODS)]
 
 
+@checked
 @dataclass(frozen=True)
 class LQRSettings:
     """How a method is trained. The defaults are the paper's, where it states them.
@@ -37,32 +49,20 @@ class LQRSettings:
         gain_scale: the same for the controllers behind Phi (not published).
     """
 
-    method: str
-    optimizer: str = "adam"
-    learning_rate: float = 1e-3
-    num_iterations: int = 5000
-    weight_decay: float = 0.0
-    max_gradient_norm: float | None = None
-    num_hidden: int = 200
-    phi_scale: float = 0.001
-    gain_scale: float = 0.001
-
-    def __post_init__(self) -> None:
-        check_choice("method", self.method, LQR_METHODS)
-        check_choice("optimizer", self.optimizer, OPTIMIZERS)
-        check_number("learning_rate", self.learning_rate, above=0)
-        check_count("num_iterations", self.num_iterations, minimum=0)
-        check_number("weight_decay", self.weight_decay, least=0)
-        if self.max_gradient_norm is not None:
-            check_number("max_gradient_norm", self.max_gradient_norm, above=0)
-        check_count("num_hidden", self.num_hidden)
-        check_number("phi_scale", self.phi_scale, least=0)
-        check_number("gain_scale", self.gain_scale, least=0)
+    method: Method
+    optimizer: Annotated[str, one_of(OPTIMIZERS)] = "adam"
+    learning_rate: Positive = 1e-3
+    num_iterations: Natural = 5000
+    weight_decay: NonNegative = 0.0
+    max_gradient_norm: Positive | None = None
+    num_hidden: Count = 200
+    phi_scale: NonNegative = 0.001
+    gain_scale: NonNegative = 0.001
 
 
-def published_lqr(method: str) -> LQRSettings:
+@checked
+def published_lqr(method: Method) -> LQRSettings:
     """The settings behind Tables 1 and 2; for Phi the reading that comes closest (see the book)."""
-    check_choice("method", method, LQR_METHODS)
     if method == "ipo_fixed_phi":
         return LQRSettings(method, learning_rate=5e-4)
     if method == "ipo_variable_phi":
@@ -78,30 +78,28 @@ class Learner:
     gain: Callable[[], Tensor]
 
 
+@checked
 def gradient_descent(
-    problem: LQR, settings: LQRSettings, start: Tensor, seeds: Sequence[int]
+    problem: LQR, settings: LQRSettings, start: Gains, seeds: Annotated[Seeds, "R"]
 ) -> Learner:
     """One player that owns all domains: gradient descent on the pooled cost of K."""
     player = _players(settings, start, num_players=1)
     return Learner(
-        iterate=lambda: player.round([lambda K: training_costs(K, problem).mean(1)]),
+        iterate=lambda: player.round([lambda K: _pooled_cost(K, problem)]),
         gain=lambda: player.policy,
     )
 
 
+@checked
 def overparameterized(
-    problem: LQR, settings: LQRSettings, start: Tensor, seeds: Sequence[int]
+    problem: LQR, settings: LQRSettings, start: Gains, seeds: Annotated[Seeds, "R"]
 ) -> Learner:
     """The same player with a controller of two layers, ``K = K_2 K_1``, and one optimiser."""
     Phi, K = _random_layers(problem, settings, seeds)
     optimizer = _optimizer(settings, [Phi, K])
 
     def respond(_: int) -> None:
-        descend(
-            optimizer,
-            lambda: training_costs(K @ Phi, problem).mean(1),
-            settings.max_gradient_norm,
-        )
+        descend(optimizer, lambda: _pooled_cost(K @ Phi, problem), settings.max_gradient_norm)
 
     return Learner(
         iterate=lambda: play_round(1, respond),
@@ -109,21 +107,23 @@ def overparameterized(
     )
 
 
+@checked
 def ipo_fixed_phi(
-    problem: LQR, settings: LQRSettings, start: Tensor, seeds: Sequence[int]
+    problem: LQR, settings: LQRSettings, start: Gains, seeds: Annotated[Seeds, "R"]
 ) -> Learner:
     """A player per domain, each with a whole controller; their average acts (Phi = identity)."""
     players = _players(settings, start, problem.num_domains)
     observations = [W.contiguous() for W in problem.W_train.unbind(1)]  # twice as fast
-    costs = [lambda K, W=W: expected_cost(K, problem, W) for W in observations]
+    costs = [lambda K, W=W: feedback_costs(K @ W, problem) for W in observations]
     return Learner(
         iterate=lambda: players.round(costs),
         gain=lambda: players.policy,
     )
 
 
+@checked
 def ipo_variable_phi(
-    problem: LQR, settings: LQRSettings, start: Tensor, seeds: Sequence[int]
+    problem: LQR, settings: LQRSettings, start: Gains, seeds: Annotated[Seeds, "R"]
 ) -> Learner:
     """Phi moves on the pooled cost of all domains, then every player on its own, above Phi."""
     Phi, K = _random_layers(problem, settings, seeds)
@@ -134,14 +134,14 @@ def ipo_variable_phi(
     def move_phi() -> None:
         descend(
             optimizer,
-            lambda: training_costs(players.policy @ Phi, problem).mean(1),
+            lambda: _pooled_cost(players.policy @ Phi, problem),
             settings.max_gradient_norm,
         )
         seen = split_domains(Phi.detach() @ problem.seen, problem.num_domains)
         features[:] = seen.unbind(1)
 
     costs = [
-        lambda K, d=d: expected_cost(K, problem, features[d]) for d in range(problem.num_domains)
+        lambda K, d=d: feedback_costs(K @ features[d], problem) for d in range(problem.num_domains)
     ]
     return Learner(
         iterate=lambda: players.round(costs, move_phi=move_phi),
@@ -155,12 +155,13 @@ LEARNERS = {
 }
 
 
+@checked
 def train(
     problem: LQR,
     settings: LQRSettings,
-    seeds: Sequence[int],
-    start: Tensor | None = None,
-    checkpoints: Sequence[int] = (),
+    seeds: Annotated[Seeds, "R"],
+    start: Gains | None = None,
+    checkpoints: Sequence[Natural] = (),
 ) -> Iterator[tuple[int, Tensor]]:
     """Train all runs of ``problem`` at once.
 
@@ -177,10 +178,9 @@ def train(
 
     Raises:
         ValueError: seeds or start of the wrong number or shape, a start with NaN, a start
-            with an unstable closed loop, before anything is trained.
+            with an unstable closed loop, a checkpoint after the end; before anything is trained.
     """
-    if len(seeds) != problem.num_runs:
-        raise ValueError(f"seeds = {list(seeds)}: must be one for each of {problem.num_runs} runs")
+    check_checkpoints(checkpoints, settings.num_iterations)
     start = _checked_start(problem, settings, start)
     make = LEARNERS[settings.method]
     if settings.optimizer == "lbfgs":  # its curvature model would mix the runs: one at a time
@@ -198,6 +198,12 @@ def train(
         if iteration < settings.num_iterations:
             for learner in learners:
                 learner.iterate()
+
+
+def _pooled_cost(K: Tensor, problem: LQR) -> Tensor:
+    """Of all training domains, ``[R]``."""
+    F = split_domains(K @ problem.seen, problem.num_domains)
+    return feedback_costs(F, problem).mean(1)
 
 
 def _players(settings: LQRSettings, start: Tensor, num_players: int) -> LinearPlayers:
@@ -234,16 +240,11 @@ def _random_layers(
 
 
 def _checked_start(problem: LQR, settings: LQRSettings, start: Tensor | None) -> Tensor:
-    shape = (problem.num_runs, *problem.gain_shape)
     if start is None:
-        return torch.zeros(shape, dtype=problem.A.dtype)
+        return torch.zeros(problem.num_runs, *problem.gain_shape, dtype=problem.A.dtype)
     if settings.method in ("overparameterized", "ipo_variable_phi"):
         raise ValueError(f"start: {settings.method} starts from random layers, not from a gain")
-    if tuple(start.shape) != shape:
-        raise ValueError(f"start: has shape {tuple(start.shape)}, must have {shape}")
-    if not bool(torch.isfinite(start).all()):
-        raise ValueError("start: holds NaN or infinite entries, must be finite")
-    return start.to(problem.A)
+    return start
 
 
 def _check_stable(name: str, K: Tensor, problem: LQR) -> None:

@@ -14,13 +14,13 @@ import itertools
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ipo.checks import check_count
+from ipo.checks import Count, checked
 from ipo.distributions import Categorical, Distribution, Gaussian, Generators
 from ipo.game import average
 
@@ -48,7 +48,8 @@ class Network(ABC):
         shapes = {f"{layer}.weight": shape for layer, shape in self.shapes.items()}
         return shapes | {f"{layer}.bias": shape[1:] for layer, shape in self.shapes.items()}
 
-    def start(self, generators: Generators) -> Weights:
+    @checked
+    def start(self, generators: Annotated[Generators, "R"]) -> Weights:
         """Random weights, one run for each generator."""
         runs = [self._draw(generator) for generator in generators]
         return {
@@ -64,8 +65,16 @@ class Network(ABC):
     def __call__(self, weights: Weights, observations: Tensor) -> Outputs:
         """``observations [R, B, ...]`` -> parameters ``[R, B, P]``, values ``[R, B]``."""
 
+    @checked
+    def _check(self, players: Annotated[Sequence[Weights], "E"]) -> None:
+        for d, player in enumerate(players):
+            shapes = {name: tuple(weight.shape[1:]) for name, weight in player.items()}
+            if shapes != self.weight_shapes:
+                raise ValueError(f"players[{d}]: of shapes {shapes}, must be {self.weight_shapes}")
+
     def frozen(self, players: Sequence[Weights]) -> Acting:
         """The average that acts, without gradients, as a function of observations."""
+        self._check(players)
 
         @torch.no_grad()
         def policy(observations: Tensor) -> Outputs:
@@ -92,17 +101,14 @@ class DenseNetwork(Network):
         hidden: units of each hidden layer.
     """
 
+    @checked
     def __init__(
         self,
-        num_observations: int,
-        num_actions: int,
+        num_observations: Count,
+        num_actions: Count,
         distribution: type[Distribution] = Gaussian,
-        hidden: Sequence[int] = (64, 64),
+        hidden: Sequence[Count] = (64, 64),
     ) -> None:
-        check_count("num_observations", num_observations)
-        check_count("num_actions", num_actions)
-        for units in hidden:
-            check_count("hidden", units)
         self.distribution, self.num_actions = distribution, num_actions
         self.layers: dict[str, list[str]] = {}
         self.shapes = {}
@@ -144,6 +150,7 @@ class DenseNetwork(Network):
 
         In NumPy on the CPU: for the few rows of a step, torch would take five times as long.
         """
+        self._check(players)
         if next(iter(players[0].values())).device.type != "cpu":
             return super().frozen(players)
         weights = [
@@ -191,7 +198,8 @@ class GridNetwork(Network):
 
     distribution = Categorical
 
-    def __init__(self, num_channels: int = 3, num_actions: int = 7) -> None:
+    @checked
+    def __init__(self, num_channels: Count = 3, num_actions: Count = 7) -> None:
         self.shapes = {
             "conv1": (4 * num_channels, 16),
             "conv2": (4 * 16, 32),
@@ -236,7 +244,8 @@ class OnTable:
     The network is evaluated once for each row that occurs, not once for each occurrence.
     """
 
-    def __init__(self, network: GridNetwork, table: Tensor) -> None:
+    @checked
+    def __init__(self, network: GridNetwork, table: Annotated[Tensor, "K 7 7 C"]) -> None:
         self.network, self.table = network, table
         self.distribution, self.start = network.distribution, network.start
 
@@ -248,6 +257,7 @@ class OnTable:
 
     def average(self, players: Sequence[Weights]) -> Outputs:
         """What the players' average makes of the whole table: ``[R, K, A]`` and ``[R, K]``."""
+        self.network._check(players)
         weight = next(iter(players[0].values()))
         policy = self.network.frozen(players)
         # In pieces, which stay in the processor's cache.
@@ -262,6 +272,7 @@ class OnTable:
         return lambda indices: (_take(logits, indices), values.gather(1, indices))
 
 
+@checked
 def copied(players: Sequence[Weights]) -> list[Weights]:
     """The players as they are now, without gradients; training changes weights in place."""
     return [{name: w.detach().clone() for name, w in player.items()} for player in players]

@@ -7,17 +7,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Annotated
 
 import torch
 from torch import Tensor
 
-from ipo.checks import check_choice, check_number
+from ipo.checks import NonNegative, Positive, checked, one_of
 
 OPTIMIZERS = ("adam", "plain", "lbfgs")
 
 
+@checked
 def make_optimizer(
-    name: str, weights: Sequence[Tensor], learning_rate: float, weight_decay: float = 0.0
+    name: Annotated[str, one_of(OPTIMIZERS)],
+    weights: Annotated[Sequence[Tensor], "leaves"],
+    learning_rate: Positive,
+    weight_decay: NonNegative = 0.0,
 ) -> torch.optim.Optimizer:
     """An optimiser for leaves ``[runs, ...]``.
 
@@ -27,9 +32,6 @@ def make_optimizer(
     Raises:
         ValueError: an unknown name, a learning rate that is not positive, a negative decay.
     """
-    check_choice("optimizer", name, OPTIMIZERS)
-    check_number("learning_rate", learning_rate, above=0)
-    check_number("weight_decay", weight_decay, least=0)
     if name == "adam":  # decoupled decay (AdamW); with weight_decay = 0 it is Adam itself
         return torch.optim.AdamW(weights, learning_rate, weight_decay=weight_decay, fused=True)
     if name == "plain":

@@ -9,20 +9,28 @@ Axes: R runs, E players, N copies of the environments, T steps, F = N T frames.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ipo.checks import check_choice, check_count, check_counts, check_number
+from ipo.checks import (
+    Count,
+    NonNegative,
+    Positive,
+    Probability,
+    Seeds,
+    check_count,
+    checked,
+    one_of,
+)
 from ipo.distributions import Distribution, Generators
 from ipo.game import domains_of_players, play_round
 from ipo.networks import Network, OnTable, Weights
-from ipo.rollouts import TIME_OUTS, Collector, Environments, Rollout
+from ipo.rollouts import Collector, Environments, Rollout, TimeOuts
 
 METHODS = ("ppo", "ipo", "ensemble")
 NORMALIZATIONS = ("none", "minibatch", "rollout")
@@ -31,6 +39,7 @@ NORMALIZATIONS = ("none", "minibatch", "rollout")
 MakeEnvironments = Callable[[list[int], list[int], Generators], Environments]
 
 
+@checked
 @dataclass(frozen=True)
 class PPOSettings:
     """How a policy is trained. Sizes and rates are those of the paper's coloured keys (Table 6).
@@ -63,43 +72,26 @@ class PPOSettings:
             published keys do, by a side effect of code for recurrent networks.
     """
 
-    method: str
-    learning_rate: float = 1e-3
-    adam_epsilon: float = 1e-8
-    num_updates: int = 20
-    num_envs: int | tuple[int, ...] = 48
-    num_steps: int = 128
-    num_epochs: int = 4
-    minibatch_size: int = 256
-    num_minibatches: int | None = None
-    clip: float = 0.2
-    value_weight: float = 0.5
-    entropy_weight: float = 0.01
-    max_gradient_norm: float = 0.5
-    discount: float = 0.99
-    gae_lambda: float = 0.95
+    method: Annotated[str, one_of(METHODS)]
+    learning_rate: Positive = 1e-3
+    adam_epsilon: Positive = 1e-8
+    num_updates: Count = 20
+    num_envs: Count | Annotated[tuple[Count, ...], "domains"] = 48
+    num_steps: Count = 128
+    num_epochs: Count = 4
+    minibatch_size: Count = 256
+    num_minibatches: Count | None = None
+    clip: Positive = 0.2
+    value_weight: NonNegative = 0.5
+    entropy_weight: NonNegative = 0.01
+    max_gradient_norm: Positive = 0.5
+    discount: Probability = 0.99
+    gae_lambda: Probability = 0.95
     normalize_rewards: bool = False
-    reward_clip: float = 10.0
-    normalize_advantages: str = "none"
-    time_outs: str = "bootstrap"
+    reward_clip: Positive = 10.0
+    normalize_advantages: Annotated[str, one_of(NORMALIZATIONS)] = "none"
+    time_outs: TimeOuts = "bootstrap"
     skip_last_frames: bool = False
-
-    def __post_init__(self) -> None:
-        check_choice("method", self.method, METHODS)
-        check_choice("normalize_advantages", self.normalize_advantages, NORMALIZATIONS)
-        check_choice("time_outs", self.time_outs, TIME_OUTS)
-        for name in ("num_updates", "num_steps", "num_epochs", "minibatch_size"):
-            check_count(name, getattr(self, name))
-        for count in self.num_envs if isinstance(self.num_envs, tuple) else (self.num_envs,):
-            check_count("num_envs", count)
-        if self.num_minibatches is not None:
-            check_count("num_minibatches", self.num_minibatches)
-        for name in ("learning_rate", "adam_epsilon", "clip", "max_gradient_norm", "reward_clip"):
-            check_number(name, getattr(self, name), above=0, below=math.inf)
-        for name in ("value_weight", "entropy_weight"):
-            check_number(name, getattr(self, name), least=0)
-        for name in ("discount", "gae_lambda"):
-            check_number(name, getattr(self, name), least=0, most=1)
 
     def domains_of_players(self, num_domains: int) -> list[list[int]]:
         """The domains that each player owns; ``ppo`` is what the game calls ``pooled``."""
@@ -127,6 +119,7 @@ class PPOSettings:
 
     def size_of_minibatches(self, num_frames: int) -> int:
         """Of a rollout with ``num_frames``."""
+        check_count("num_frames", num_frames)
         if self.num_minibatches is not None:
             name, size = "num_minibatches", num_frames // self.num_minibatches
         else:
@@ -138,11 +131,20 @@ class PPOSettings:
             )
         return size
 
+    @checked
     def collector(self, environments: Environments, device: str = "cpu") -> Collector:
         """Of a player in its environments."""
         clip = self.reward_clip if self.normalize_rewards else None
         sizes = self.num_steps, self.discount, self.gae_lambda
         return Collector(environments, *sizes, self.time_outs, clip, device)
+
+
+def check_device(name: str, device: str) -> None:
+    """Torch has several errors for a device that it cannot use."""
+    try:
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError, ImportError) as error:
+        raise ValueError(f"{name} = {device!r}: must be one that torch can use: {error}") from error
 
 
 class Training:
@@ -167,17 +169,16 @@ class Training:
             a device that is not there.
     """
 
+    @checked
     def __init__(
         self,
         network: Network | OnTable,
         make_environments: MakeEnvironments,
-        num_domains: int,
+        num_domains: Count,
         settings: PPOSettings,
-        seeds: Sequence[int],
-        device: str = "cpu",
+        seeds: Seeds,
+        device: Annotated[str, check_device] = "cpu",
     ) -> None:
-        check_counts("seeds", seeds, minimum=0)
-        check_device(device)
         owned = settings.domains_of_players(num_domains)
         copies = settings.copies_of_players(num_domains)
         for own in copies:
@@ -215,6 +216,7 @@ class Training:
         if only is None:
             play_round(len(self.players), self.respond, num_inner_rounds=1, move_phi=None)
         else:
+            check_count("only", only, 0, len(self.players) - 1)
             self.respond(only)
 
     def respond(self, d: int) -> None:
@@ -265,6 +267,12 @@ class Training:
     @torch.no_grad()
     def set_players(self, players: Sequence[Weights]) -> None:
         """Go on from other weights; what the optimisers remember stays."""
+        have, want = (
+            [{name: weight.shape for name, weight in player.items()} for player in of]
+            for of in (players, self.players)
+        )
+        if have != want:
+            raise ValueError(f"players: of shapes {have}, must be {want}")
         for own, weights in zip(self.players, players, strict=True):
             for name, weight in own.items():
                 weight.copy_(weights[name])
@@ -295,14 +303,6 @@ class Training:
 
     def _generators(self) -> list[np.random.Generator]:
         return [*self.draws, *self.resets, *self.orders]
-
-
-def check_device(device: str) -> None:
-    """Torch has several errors for a device that it cannot use."""
-    try:
-        torch.empty(0, device=device)
-    except (RuntimeError, AssertionError, ImportError) as error:
-        raise ValueError(f"device = {device!r}: must be one that torch can use: {error}") from error
 
 
 def minibatches(

@@ -6,17 +6,19 @@ Axes: R runs, N copies of the environments, T steps.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Annotated, Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import torch
 from gymnasium.vector import AutoresetMode, VectorEnv
 from torch import Tensor
 
+from ipo.checks import Count, Positive, Probability, checked, one_of
 from ipo.distributions import Distribution, Generators
 from ipo.networks import Acting
 
 TIME_OUTS = ("bootstrap", "terminal", "no_advantage")
+TimeOuts = Annotated[str, one_of(TIME_OUTS)]
 
 
 class Step(NamedTuple):
@@ -32,6 +34,7 @@ class Step(NamedTuple):
     last_observation: Tensor
 
 
+@runtime_checkable
 class Environments(Protocol):
     """``[R, N]`` copies of environments.
 
@@ -106,7 +109,10 @@ class RewardNormalizer:
         clip: c.
     """
 
-    def __init__(self, num_runs: int, num_copies: int, discount: float, clip: float) -> None:
+    @checked
+    def __init__(
+        self, num_runs: Count, num_copies: Count, discount: Probability, clip: Positive
+    ) -> None:
         self.discount, self.clip = discount, clip
         self.discounted = torch.zeros(num_runs, num_copies, dtype=torch.float64)
         self.moments = torch.zeros(3, num_runs, dtype=torch.float64)  # sums of 1, G and G^2
@@ -145,6 +151,7 @@ class Rollout(NamedTuple):
         return Rollout(*(x.flatten(1, 2) for x in self))
 
 
+@checked
 @dataclass
 class Collector:
     """One player's copies of environments, which go on from rollout to rollout.
@@ -160,11 +167,11 @@ class Collector:
     """
 
     environments: Environments
-    num_steps: int
-    discount: float
-    gae_lambda: float
-    time_outs: str = "bootstrap"
-    reward_clip: float | None = None
+    num_steps: Count
+    discount: Probability
+    gae_lambda: Probability
+    time_outs: TimeOuts = "bootstrap"
+    reward_clip: Positive | None = None
     device: str = "cpu"
 
     def __post_init__(self) -> None:

@@ -8,6 +8,8 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
+from typing import Annotated
 
 import numpy as np
 import scipy.stats
@@ -15,7 +17,7 @@ import torch
 from torch import Tensor
 
 from ipo.causality.predictors import check_domains
-from ipo.checks import check_count, check_number
+from ipo.checks import check_count, check_number, checked
 
 
 @dataclass(frozen=True)
@@ -35,7 +37,12 @@ class ICPResult:
     coefficients: np.ndarray
 
 
-def icp(features: Sequence[Tensor], targets: Sequence[Tensor], alpha: float = 0.05) -> ICPResult:
+@checked
+def icp(
+    features: Sequence[Tensor],
+    targets: Sequence[Tensor],
+    alpha: Annotated[float, partial(check_number, above=0, below=1)] = 0.05,
+) -> ICPResult:
     """Invariant causal prediction for one run: ``[N_e, d]`` and ``[N_e]`` for every domain.
 
     A set S is accepted if the residuals of one pooled regression on S have the same mean and
@@ -49,18 +56,18 @@ def icp(features: Sequence[Tensor], targets: Sequence[Tensor], alpha: float = 0.
 
     Raises:
         ValueError: see :func:`ipo.causality.predictors.check_domains`; also for a level outside
-            (0, 1), for a single domain, and for a feature that is constant in all of them.
+            (0, 1), a single domain, a single sample of one, and features of which one is constant
+            or a sum of others.
     """
-    check_number("alpha", alpha, above=0)
-    if alpha >= 1:
-        raise ValueError(f"alpha = {alpha}: must be below 1")
     check_domains([x.unsqueeze(0) for x in features], [y.unsqueeze(0) for y in targets])
-    check_count("number of domains", len(features), minimum=2)
+    check_count("features: number of domains", len(features), minimum=2)
+    check_count("features: samples of a domain", min(map(len, features)), minimum=2)
     dim = features[0].shape[1]
-    pooled = torch.cat(list(features))
-    for j in range(dim):
-        if bool((pooled[:, j] == pooled[0, j]).all()):
-            raise ValueError(f"feature {j} = {float(pooled[0, j])}: must not be constant")
+    pooled = torch.cat(list(features)).double()
+    if torch.linalg.matrix_rank(torch.column_stack([pooled, torch.ones(len(pooled))])) <= dim:
+        raise ValueError(
+            f"features: with a constant, {dim} have a smaller rank, must be independent"
+        )
 
     # Columns: the features, the target, and ones; their products tell all that is needed.
     tables = [

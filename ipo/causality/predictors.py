@@ -14,16 +14,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Annotated, Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
 
-from ipo.checks import check_count, check_number
+from ipo.checks import Count, Natural, NonNegative, Positive, check_array, check_count, checked
 from ipo.game import Cost, LinearPlayers
 from ipo.optimizers import descend, make_optimizer
 
 
+@runtime_checkable
 class Task(Protocol):
     """Domains in which a linear predictor is judged."""
 
@@ -37,6 +38,7 @@ class Task(Protocol):
     def domain(self, e: int) -> Task: ...
 
 
+@checked
 @dataclass(frozen=True)
 class Regression:
     """Squared error, of which second moments tell everything.
@@ -49,9 +51,9 @@ class Regression:
         power: ``E[y^2] [R, E]``.
     """
 
-    gram: Tensor
-    moment: Tensor
-    power: Tensor
+    gram: Annotated[Tensor, "R E d d"]
+    moment: Annotated[Tensor, "R E d"]
+    power: Annotated[Tensor, "R E"]
 
     @classmethod
     def from_samples(cls, features: Sequence[Tensor], targets: Sequence[Tensor]) -> Regression:
@@ -73,6 +75,10 @@ class Regression:
     def dtype(self) -> torch.dtype:
         return self.moment.dtype
 
+    @property
+    def sizes(self) -> dict[str, Any]:
+        return dict(zip(("R", "E", "d"), self.shape, strict=True))
+
     def risks(self, v: Tensor) -> Tensor:
         v = v.unsqueeze(1)
         image = (self.gram @ v.unsqueeze(-1)).squeeze(-1)
@@ -81,7 +87,9 @@ class Regression:
     def gradients(self, v: Tensor) -> Tensor:
         return 2 * ((self.gram @ v[:, None, :, None]).squeeze(-1) - self.moment)
 
-    def domain(self, e: int) -> Regression:
+    @checked
+    def domain(self, e: Natural) -> Regression:
+        check_count("e", e, 0, self.shape[1] - 1)
         return Regression(*(part[:, e : e + 1] for part in (self.gram, self.moment, self.power)))
 
     @property
@@ -103,7 +111,8 @@ class Regression:
         """Each domain's own least squares ``[R, E, d]``."""
         return torch.linalg.solve(self.gram, self.moment)
 
-    def pooled(self, shares: Sequence[float] | None = None) -> Tensor:
+    @checked
+    def pooled(self, shares: Annotated[Sequence[Positive], "E"] | None = None) -> Tensor:
         """Least squares on the data of all domains ``[R, d]``, with each one's share of the data.
 
         Shares are equal if none are given.
@@ -111,13 +120,7 @@ class Regression:
         Raises:
             ValueError: not one share for each domain, a share that is not positive.
         """
-        num = self.shape[1]
-        shares = [1.0] * num if shares is None else list(shares)
-        if len(shares) != num:
-            raise ValueError(f"shares = {shares}: must be {num} numbers, one for each domain")
-        for e, share in enumerate(shares):
-            check_number(f"shares[{e}]", share, above=0)
-        weights = torch.tensor(shares, dtype=self.dtype)
+        weights = torch.tensor(shares or [1.0] * self.shape[1], dtype=self.dtype)
         gram = torch.einsum("e,repq->rpq", weights, self.gram)
         return torch.linalg.solve(gram, torch.einsum("e,rep->rp", weights, self.moment))
 
@@ -136,6 +139,9 @@ class Classification:
 
     def __post_init__(self) -> None:
         check_domains(self.features, self.targets)
+        for e, y in enumerate(self.targets):
+            if bool(((y != 0) & (y != 1)).any()):
+                raise ValueError(f"targets[{e}]: holds other labels, must hold 0 and 1")
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -163,10 +169,13 @@ class Classification:
         wrong = [((f > 0) != (y > 0.5)).double().mean(1) for _, y, f in self._outputs(v)]
         return torch.stack(wrong, 1)
 
-    def domain(self, e: int) -> Classification:
+    @checked
+    def domain(self, e: Natural) -> Classification:
+        check_count("e", e, 0, self.shape[1] - 1)
         return Classification(self.features[e : e + 1], self.targets[e : e + 1])
 
 
+@checked
 @dataclass(frozen=True)
 class PredictorSettings:
     """How a method is trained, with Adam on all samples at once.
@@ -180,26 +189,18 @@ class PredictorSettings:
         bound: largest absolute value of a player's coefficients; ``None``: no bound.
     """
 
-    penalty: float = 0.0
-    num_features: int = 1
-    ridge: float = 0.0
-    learning_rate: float = 0.01
-    num_iterations: int = 5000
-    bound: float | None = None
-
-    def __post_init__(self) -> None:
-        check_number("penalty", self.penalty, least=0)
-        check_count("num_features", self.num_features)
-        check_number("ridge", self.ridge, least=0)
-        check_number("learning_rate", self.learning_rate, above=0)
-        check_count("num_iterations", self.num_iterations, minimum=0)
-        if self.bound is not None:
-            check_number("bound", self.bound, above=0)
+    penalty: NonNegative = 0.0
+    num_features: Count = 1
+    ridge: NonNegative = 0.0
+    learning_rate: Positive = 0.01
+    num_iterations: Natural = 5000
+    bound: Positive | None = None
 
 
 # ------------------------------------------------------------------- risk with a penalty
 
 
+@checked
 def erm(task: Task, settings: PredictorSettings) -> Tensor:
     """Empirical risk minimisation: the predictor that is best on all data together.
 
@@ -209,6 +210,7 @@ def erm(task: Task, settings: PredictorSettings) -> Tensor:
     return _minimize(lambda: _objective(task, settings, v).mean(1), v, settings)
 
 
+@checked
 def irmv1(task: Task, settings: PredictorSettings) -> Tensor:
     """Invariant risk minimisation, first version, for ``v = Phi w`` with w fixed at ones::
 
@@ -235,6 +237,7 @@ def irm_penalties(task: Task, Phi: Tensor) -> Tensor:
     return (task.gradients(Phi.sum(-1)) @ Phi).square().mean(-1)
 
 
+@checked
 def vrex(task: Task, settings: PredictorSettings) -> Tensor:
     """Risk extrapolation: the risks are to be low, and equal.
 
@@ -254,6 +257,7 @@ def vrex(task: Task, settings: PredictorSettings) -> Tensor:
 # ----------------------------------------------------------------------------- the game
 
 
+@checked
 def irm_game_fixed_phi(task: Task, settings: PredictorSettings) -> Tensor:
     """IRM-Games with Phi = identity: a predictor for each domain, and their average acts.
 
@@ -268,6 +272,7 @@ def irm_game_fixed_phi(task: Task, settings: PredictorSettings) -> Tensor:
     return players.policy
 
 
+@checked
 def irm_game_variable_phi(task: Task, settings: PredictorSettings) -> Tensor:
     """The same above a shared ``Phi [R, d, k]``, which moves first, on the pooled risk.
 
@@ -300,7 +305,7 @@ def irm_game_variable_phi(task: Task, settings: PredictorSettings) -> Tensor:
 def _players(task: Task, settings: PredictorSettings, dim: int) -> LinearPlayers:
     """A player for each domain, all starting at zero, each with an Adam of its own."""
     num_runs, num_domains, _ = task.shape
-    check_count("number of domains", num_domains, minimum=2)
+    check_count("task: number of domains", num_domains, minimum=2)
     return LinearPlayers(
         torch.zeros(num_runs, num_domains, dim, dtype=task.dtype),
         lambda weights: make_optimizer("adam", weights, settings.learning_rate),
@@ -356,28 +361,17 @@ PREDICTOR_METHODS = {
 }
 
 
-def check_domains(features: Sequence[Tensor], targets: Sequence[Tensor]) -> None:
+@checked
+def check_domains(
+    features: Annotated[Sequence[Tensor], "E"], targets: Annotated[Sequence[Tensor], "E"]
+) -> None:
     """Features ``[R, N_e, d]`` and targets ``[R, N_e]`` of domains that fit together.
 
     Raises:
         ValueError: no domain, no samples, shapes that do not fit, numbers that are not finite.
     """
-    if not features:
-        raise ValueError("features = []: must hold at least 1 domain")
-    if len(features) != len(targets):
-        raise ValueError(f"targets: of {len(targets)} domains, must be of {len(features)}")
+    sizes: dict[str, Any] = {}
     for e, (x, y) in enumerate(zip(features, targets, strict=True)):
-        if x.shape[-1] != features[0].shape[-1]:
-            raise ValueError(
-                f"features[{e}]: has {x.shape[-1]} features, must have "
-                f"{features[0].shape[-1]} as in domain 0"
-            )
-        if x.shape[:-1] != y.shape:
-            raise ValueError(
-                f"targets[{e}]: has shape {tuple(y.shape)}, must have {tuple(x.shape[:-1])}"
-            )
-        if x.shape[-2] == 0:
-            raise ValueError(f"features[{e}]: has 0 samples, must have at least 1")
-        for name, values in (("features", x), ("targets", y)):
-            if not bool(torch.isfinite(values).all()):
-                raise ValueError(f"{name}[{e}]: holds NaN or infinite values, must be finite")
+        sizes.pop("N_e", None)  # the only size in which domains may differ
+        check_array(f"features[{e}]", x, "R N_e d", sizes)
+        check_array(f"targets[{e}]", y, "R N_e", sizes)

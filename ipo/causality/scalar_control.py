@@ -11,10 +11,13 @@ works only where beta is what it was. The invariant controller has ``k_2 = 0``.
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import torch
 from scipy.optimize import minimize_scalar
 from torch import Tensor
 
+from ipo.checks import checked
 from ipo.game import Cost
 
 DECAY = 0.99
@@ -22,7 +25,8 @@ NOISE_1, NOISE_2 = 1.0, 0.1
 EDGE = 0.01  # room to instability below which training sees a straight line instead of the cost
 
 
-def stationary_cost(gains: Tensor, beta: Tensor) -> Tensor:
+@checked
+def stationary_cost(gains: Annotated[Tensor, "... 2"], beta: Annotated[Tensor, "..."]) -> Tensor:
     """``J(k) [...]`` of gains ``[..., 2]`` at ``beta [...]``; inf where the loop is unstable.
 
     f = k_1 + beta k_2,        v = 1 k_1^2 + 0.1^2 k_2^2        (variance of the input's noise)
@@ -53,16 +57,13 @@ def _loop(gains: Tensor, beta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return feedback, noise, 1 - (DECAY - feedback) ** 2
 
 
-def costs(betas: Tensor) -> list[Cost]:
+@checked
+def costs(betas: Annotated[Tensor, "R E"]) -> list[Cost]:
     """The training cost of every domain; ``betas [R, E]``.
 
     Raises:
         ValueError: a shape other than [problems, domains], a beta that is not finite.
     """
-    if betas.dim() != 2:
-        raise ValueError(f"betas: has shape {tuple(betas.shape)}, must be [problems, domains]")
-    if not bool(torch.isfinite(betas).all()):
-        raise ValueError("betas: holds NaN or infinite coefficients, must be finite")
 
     def cost_at(beta: Tensor) -> Cost:
         return lambda gains: training_cost(gains, beta)
@@ -70,7 +71,8 @@ def costs(betas: Tensor) -> list[Cost]:
     return [cost_at(beta) for beta in betas.unbind(1)]
 
 
-def unseen_cost(gains: Tensor, betas: Tensor) -> Tensor:
+@checked
+def unseen_cost(gains: Annotated[Tensor, "R 2"], betas: Annotated[Tensor, "B"]) -> Tensor:
     """Mean cost ``[R]`` of gains ``[R, 2]`` over ``betas [B]``; inf if one of them is unstable."""
     return stationary_cost(gains.unsqueeze(1), betas).mean(1)
 
@@ -79,7 +81,7 @@ def invariant_gains() -> Tensor:
     """The best controller ``[2]`` among those with ``k_2 = 0``; it costs the same everywhere."""
 
     def cost(k_1: float) -> float:
-        return float(stationary_cost(torch.tensor([k_1, 0.0]).double(), torch.tensor(0.0)))
+        return float(stationary_cost(torch.tensor([k_1, 0.0]).double(), torch.tensor(0.0).double()))
 
     best = minimize_scalar(cost, bounds=(0.0, 1.9), method="bounded", options={"xatol": 1e-12})
     return torch.tensor([best.x, 0.0], dtype=torch.float64)

@@ -19,41 +19,37 @@ import numpy as np
 import pandas as pd
 import scipy.stats
 
-from ipo.checks import check_choice, check_count, check_number
+from ipo.checks import Count, NonNegative, check_array, check_choice, checked
 
 Noise = Callable[[np.random.Generator, int], np.ndarray]
 
 
+@checked
 @dataclass(frozen=True)
 class Normal:
     """Noise ``N(mean, std^2)``; ``std = 0`` is a constant."""
 
     mean: float = 0.0
-    std: float = 1.0
+    std: NonNegative = 1.0
 
-    def __post_init__(self) -> None:
-        check_number("mean", self.mean)
-        check_number("std", self.std, least=0)
-
-    def __call__(self, rng: np.random.Generator, size: int) -> np.ndarray:
+    @checked
+    def __call__(self, rng: np.random.Generator, size: Count) -> np.ndarray:
         return self.mean + self.std * rng.standard_normal(size)
 
 
-def uniform(rng: np.random.Generator, size: int) -> np.ndarray:
+@checked
+def uniform(rng: np.random.Generator, size: Count) -> np.ndarray:
     """Noise that is uniform on [0, 1); a threshold makes any binary variable of it."""
     return rng.random(size)
 
 
+@checked
 @dataclass(frozen=True)
 class Linear:
     """``x <- sum_p coefficients[p] p + noise``."""
 
     coefficients: Mapping[str, float]
     noise: Normal = Normal()
-
-    def __post_init__(self) -> None:
-        for parent, coefficient in self.coefficients.items():
-            check_number(f"coefficients[{parent!r}]", coefficient)
 
     @property
     def parents(self) -> tuple[str, ...]:
@@ -63,6 +59,7 @@ class Linear:
         return sum((c * values[p] for p, c in self.coefficients.items()), start=noise)
 
 
+@checked
 @dataclass(frozen=True)
 class Mechanism:
     """``x <- function(*parents, noise)``, any function of arrays ``[num_samples]``."""
@@ -75,9 +72,18 @@ class Mechanism:
         return self.function(*(values[parent] for parent in self.parents), noise)
 
 
+@checked
 def bernoulli(parents: Sequence[str], probability: Callable[..., np.ndarray]) -> Mechanism:
     """A binary variable that is 1 with ``probability(*parents)``."""
-    return Mechanism(tuple(parents), lambda *pa: (pa[-1] < probability(*pa[:-1])) * 1.0, uniform)
+
+    def draw(*parents_and_noise: np.ndarray) -> np.ndarray:
+        *given, noise = parents_and_noise
+        chance = np.asarray(probability(*given))
+        if not bool(((chance >= 0) & (chance <= 1)).all()):
+            raise ValueError("probability: returned other numbers, must be within [0, 1]")
+        return (noise < chance) * 1.0
+
+    return Mechanism(tuple(parents), draw, uniform)
 
 
 Assignment = Linear | Mechanism  # how a variable comes about: of its parents and a noise of its own
@@ -93,6 +99,7 @@ class SCM:
         ValueError: no variable, a parent that is no variable, a cycle.
     """
 
+    @checked
     def __init__(self, assignments: Mapping[str, Assignment]) -> None:
         if not assignments:
             raise ValueError("assignments = {}: must not be empty")
@@ -127,16 +134,17 @@ class SCM:
                 affected.add(other)
         return affected - {name}
 
-    def sample(self, num_samples: int, rng: np.random.Generator) -> pd.DataFrame:
+    @checked
+    def sample(self, num_samples: Count, rng: np.random.Generator) -> pd.DataFrame:
         """Independent samples, a column for each variable.
 
         Every variable draws from a stream of its own. So two models with the same ``rng`` differ
         only in what follows from the assignments that differ.
 
         Raises:
-            ValueError: an assignment that returns another shape than ``[num_samples]``, or NaN.
+            ValueError: an assignment that returns another shape than ``[num_samples]``, or numbers
+                that are not finite.
         """
-        check_count("num_samples", num_samples)
         streams = dict(zip(self.assignments, rng.spawn(len(self.assignments)), strict=True))
         values: dict[str, np.ndarray] = {}
         for name in self.order:
@@ -144,21 +152,24 @@ class SCM:
             value = assignment(values, assignment.noise(streams[name], num_samples))
             if np.shape(value) != (num_samples,):
                 raise ValueError(f"{name}: has shape {np.shape(value)}, must have {(num_samples,)}")
-            if np.isnan(value).any():
-                raise ValueError(f"{name}: its assignment returned NaN, must return numbers")
+            if not np.isfinite(value).all():
+                raise ValueError(f"{name}: its assignment must return finite numbers")
             values[name] = value
         return pd.DataFrame({name: values[name] for name in self.assignments})
 
+    @checked
     def intervene(self, **assignments: Assignment) -> SCM:
         """The model with other assignments (a soft intervention); parents may change, too."""
         for name in assignments:
             check_choice("intervention on", name, self.assignments)
         return SCM(self.assignments | assignments)
 
+    @checked
     def do(self, **values: float) -> SCM:
         """The model in which variables are set to values, whatever their causes say."""
         return self.intervene(**{name: Linear({}, Normal(v, 0.0)) for name, v in values.items()})
 
+    @checked
     def with_noise(self, **noises: Normal) -> SCM:
         """The model in which variables keep their function and get other noise."""
         for name in noises:
@@ -168,6 +179,7 @@ class SCM:
         )
 
 
+@checked
 def moments(model: SCM) -> tuple[pd.Series, pd.DataFrame]:
     """Exact mean and covariance of a linear model ``x = B x + eta``.
 
@@ -182,7 +194,7 @@ def moments(model: SCM) -> tuple[pd.Series, pd.DataFrame]:
     for name, assignment in model.assignments.items():
         if not isinstance(assignment, Linear):
             raise TypeError(
-                f"{name}: is a {type(assignment).__name__}, must be Linear for exact moments"
+                f"model: {name} is a {type(assignment).__name__}, must be Linear for exact moments"
             )
         for parent, coefficient in assignment.coefficients.items():
             B.loc[name, parent] = coefficient
@@ -193,18 +205,26 @@ def moments(model: SCM) -> tuple[pd.Series, pd.DataFrame]:
     return pd.Series(mean, names), pd.DataFrame(covariance, names, names)
 
 
+def _check_variables(columns: pd.Index, target: str, given: Sequence[str]) -> None:
+    for name in (target, *given):
+        check_choice("variable", name, columns)
+    if target in given:
+        raise ValueError(f"target = {target!r}: must not be among {list(given)}")
+
+
+@checked
 def population_regression(
     covariance: pd.DataFrame, target: str, predictors: Sequence[str]
 ) -> tuple[np.ndarray, float]:
     """Coefficients of the best linear prediction of ``target``, and the variance that it leaves."""
-    for name in (target, *predictors):
-        check_choice("variable", name, covariance.columns)
+    _check_variables(covariance.columns, target, predictors)
     S = list(predictors)
     cross = covariance.loc[S, target].to_numpy()
     coefficients = np.linalg.lstsq(covariance.loc[S, S].to_numpy(), cross, rcond=None)[0]
     return coefficients, float(covariance.loc[target, target] - cross @ coefficients)
 
 
+@checked
 def same_conditional(samples: Sequence[pd.DataFrame], target: str, given: Sequence[str]) -> float:
     """p-value of the hypothesis that ``P(target | given)`` is the same in all domains.
 
@@ -214,12 +234,16 @@ def same_conditional(samples: Sequence[pd.DataFrame], target: str, given: Sequen
         N log s^2 - sum_e N_e log s_e^2  ~  chi^2 with (E - 1) (|given| + 2) degrees of freedom.
 
     Raises:
-        ValueError: one domain only, a variable that is not there.
+        ValueError: one domain only, a variable that is not there or on both sides, fewer samples
+            than coefficients, values that are not finite.
     """
     if len(samples) < 2:
         raise ValueError(f"samples: has {len(samples)} domains, must have at least 2")
-    for name in (target, *given):
-        check_choice("variable", name, samples[0].columns)
+    for e, sample in enumerate(samples):
+        _check_variables(sample.columns, target, given)
+        if len(sample) < len(given) + 3:
+            raise ValueError(f"samples[{e}]: has {len(sample)}, must have {len(given) + 3} or more")
+        check_array(f"samples[{e}]", sample[[target, *given]].to_numpy(), "N variables", {})
 
     def deviance(part: pd.DataFrame) -> float:
         design = np.column_stack([np.ones(len(part)), part[list(given)]])

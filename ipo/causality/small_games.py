@@ -14,26 +14,32 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import torch
 from torch import Tensor
 
 from ipo.causality.predictors import Regression
-from ipo.checks import check_choice, check_count, check_number
-from ipo.game import (
-    ORDERS,
-    OWNERSHIPS,
-    Cost,
-    LinearPlayers,
-    average,
-    domains_of_players,
-    nash_gap,
-)
+from ipo.checks import Natural, Positive, check_checkpoints, checked, one_of
+from ipo.game import OWNERSHIPS, Cost, LinearPlayers, Order, average, domains_of_players, nash_gap
 from ipo.optimizers import make_optimizer
 
 GAME_METHODS = (*OWNERSHIPS, "separate")
 
+Costs = Annotated[Sequence[Cost], "E"]  # of the domains
+Players = Annotated[Tensor, "R E P"]
+Start = Annotated[Tensor, "R P"] | Annotated[Tensor, "R players P"]
 
+
+def _at_least_two_domains(name: str, spurious: Tensor) -> None:
+    if spurious.shape[1] < 2:
+        raise ValueError(f"{name}: has shape {tuple(spurious.shape)}, must have 2 or more domains")
+
+
+Spurious = Annotated[Tensor, "R E", _at_least_two_domains]
+
+
+@checked
 @dataclass(frozen=True)
 class GameSettings:
     """How the players move.
@@ -50,27 +56,18 @@ class GameSettings:
         max_gradient_norm: bound on the norm of each player's gradient.
     """
 
-    method: str
-    optimizer: str = "plain"
-    learning_rate: float = 0.05
-    num_rounds: int = 5000
-    bound: float | None = None
-    order: str = "in_turn"
-    max_gradient_norm: float | None = None
-
-    def __post_init__(self) -> None:
-        check_choice("method", self.method, GAME_METHODS)
-        check_choice("optimizer", self.optimizer, ("plain", "adam"))
-        check_choice("order", self.order, ORDERS)
-        check_number("learning_rate", self.learning_rate, above=0)
-        check_count("num_rounds", self.num_rounds, minimum=0)
-        for name in ("bound", "max_gradient_norm"):
-            if getattr(self, name) is not None:
-                check_number(name, getattr(self, name), above=0)
+    method: Annotated[str, one_of(GAME_METHODS)]
+    optimizer: Annotated[str, one_of(("plain", "adam"))] = "plain"
+    learning_rate: Positive = 0.05
+    num_rounds: Natural = 5000
+    bound: Positive | None = None
+    order: Order = "in_turn"
+    max_gradient_norm: Positive | None = None
 
 
+@checked
 def play(
-    costs: Sequence[Cost], start: Tensor, settings: GameSettings, checkpoints: Sequence[int] = ()
+    costs: Costs, start: Start, settings: GameSettings, checkpoints: Sequence[Natural] = ()
 ) -> Iterator[tuple[int, Tensor]]:
     """Play the game of these domains.
 
@@ -80,16 +77,16 @@ def play(
         ``(round, players [R, E, P])`` at the checkpoints and at the end.
 
     Raises:
-        ValueError: no domain, a start that is not finite or whose cost is not, before any move.
+        ValueError: no domain, a start that is not finite or whose cost is not, or of the wrong
+            number of players, a checkpoint after the end; before any move.
     """
-    _check_start(costs, start)
+    check_checkpoints(checkpoints, settings.num_rounds)
+    _check_start(costs, start, settings)
     if settings.method == "separate":
         yield from _play_separately(costs, start, settings, checkpoints)
         return
     owned = domains_of_players(settings.method, len(costs))
     starts = start if start.dim() == 3 else start.unsqueeze(1).expand(-1, len(owned), -1)
-    if starts.shape[1] != len(owned):
-        raise ValueError(f"start: is of {starts.shape[1]} players, must be of {len(owned)}")
     players = LinearPlayers(
         starts,
         lambda weights: make_optimizer(settings.optimizer, weights, settings.learning_rate),
@@ -124,20 +121,23 @@ def _mean_of(costs: Sequence[Cost]) -> Cost:
     return lambda w: torch.stack([cost(w) for cost in costs]).mean(0)
 
 
-def last(costs: Sequence[Cost], start: Tensor, settings: GameSettings) -> Tensor:
+@checked
+def last(costs: Costs, start: Start, settings: GameSettings) -> Tensor:
     """The players ``[R, E, P]`` at the end of :func:`play`."""
     *_, (_, players) = play(costs, start, settings)
     return players
 
 
-def downhill(costs: Sequence[Cost], policy: Tensor) -> Tensor:
+@checked
+def downhill(costs: Costs, policy: Annotated[Tensor, "R P"]) -> Tensor:
     """The downhill direction ``- grad J_d [R, E, P]`` of each domain at a policy ``[R, P]``."""
     leaf = policy.detach().requires_grad_()
     gradients = [torch.autograd.grad(cost(leaf).sum(), leaf)[0] for cost in costs]
     return -torch.stack(gradients, dim=1)
 
 
-def residual(costs: Sequence[Cost], players: Tensor, bound: float | None = None) -> Tensor:
+@checked
+def residual(costs: Costs, players: Players, bound: Positive | None = None) -> Tensor:
     """How far from an equilibrium, ``[R]``: the largest step that a player would still make.
 
         max over d, i of abs(clip(w_d - grad_d J_d, -bound, bound) - w_d),    grad_d = grad / E
@@ -150,7 +150,8 @@ def residual(costs: Sequence[Cost], players: Tensor, bound: float | None = None)
     return ((players + steps).clamp(-limit, limit) - players).abs().flatten(1).amax(1)
 
 
-def gap(costs: Sequence[Cost], players: Tensor, alone: GameSettings) -> Tensor:
+@checked
+def gap(costs: Costs, players: Players, alone: GameSettings) -> Tensor:
     """The Nash gap ``[R]``: every player goes down alone as ``alone`` says, bounds included.
 
     It is a lower bound that is tight if ``alone`` has enough rounds to settle.
@@ -168,7 +169,8 @@ def gap(costs: Sequence[Cost], players: Tensor, alone: GameSettings) -> Tensor:
     return nash_gap(now, torch.minimum(now, torch.stack(best, 1)))
 
 
-def vote(optima: Tensor, bound: float) -> Tensor:
+@checked
+def vote(optima: Annotated[Tensor, "... E P"], bound: Positive) -> Tensor:
     """Where bounded players' average stands at equilibrium, weight by weight: ``[..., P]``.
 
     For costs that are separable and convex in the weights, with optima ``b_d [..., E, P]``:
@@ -179,14 +181,14 @@ def vote(optima: Tensor, bound: float) -> Tensor:
     at their bounds. Two domains and a wide bound: zero where signs differ, else the optimum
     nearer to zero (Ahuja, Shanmugam and Dhurandhar, 2021). The book has the proof.
     """
-    check_number("bound", bound, above=0)
     num = optima.shape[-2]
     phantoms = bound * (1 - 2 * torch.arange(num + 1, dtype=optima.dtype) / num)
     phantoms = phantoms.unsqueeze(-1).expand(*optima.shape[:-2], -1, optima.shape[-1])
     return torch.cat([optima, phantoms], dim=-2).median(dim=-2).values
 
 
-def correlated_noise(spurious: Tensor, causal: float = 1.0) -> Regression:
+@checked
+def correlated_noise(spurious: Spurious, causal: float = 1.0) -> Regression:
     """``x_2 = rho_d e + sqrt(1 - rho_d^2) n``: related to the noise of y, uncorrelated with x_1.
 
     Features have variance 1, so costs are separable and a domain's own optimum is
@@ -195,7 +197,6 @@ def correlated_noise(spurious: Tensor, causal: float = 1.0) -> Regression:
     Raises:
         ValueError: fewer than two domains, a coefficient that is NaN or outside [-1, 1].
     """
-    _check_spurious(spurious)
     if bool((spurious.abs() > 1).any()):
         raise ValueError(f"spurious: holds {spurious.abs().max():.3g}, must be within [-1, 1]")
     gram = torch.eye(2, dtype=spurious.dtype).expand(*spurious.shape, 2, 2)
@@ -203,7 +204,8 @@ def correlated_noise(spurious: Tensor, causal: float = 1.0) -> Regression:
     return Regression(gram, moment, torch.full_like(spurious, causal**2 + 1))
 
 
-def effect_of_target(spurious: Tensor, causal: float = 1.0) -> Regression:
+@checked
+def effect_of_target(spurious: Spurious, causal: float = 1.0) -> Regression:
     """``x_2 = beta_d y + n``: an effect of y, and so correlated with x_1, too.
 
     ``spurious [R, E]`` holds the beta_d. Costs are not separable.
@@ -211,7 +213,6 @@ def effect_of_target(spurious: Tensor, causal: float = 1.0) -> Regression:
     Raises:
         ValueError: fewer than two domains, a coefficient that is not finite.
     """
-    _check_spurious(spurious)
     power = causal**2 + 1
     ones = torch.ones_like(spurious)
     rows = [ones, causal * spurious, causal * spurious, power * spurious**2 + 1]
@@ -220,22 +221,11 @@ def effect_of_target(spurious: Tensor, causal: float = 1.0) -> Regression:
     return Regression(gram, moment, power * ones)
 
 
-def _check_start(costs: Sequence[Cost], start: Tensor) -> None:
-    if not costs:
-        raise ValueError("costs: there is no domain, must be at least one")
-    if not bool(torch.isfinite(start).all()):
-        raise ValueError("start: holds NaN or infinite weights, must be finite")
+def _check_start(costs: Sequence[Cost], start: Tensor, settings: GameSettings) -> None:
+    num_players = 1 if settings.method == "pooled" else len(costs)
+    if start.dim() == 3 and start.shape[1] != num_players:
+        raise ValueError(f"start: is of {start.shape[1]} players, must be of {num_players}")
     policy = average(start) if start.dim() == 3 else start
     for d, cost in enumerate(costs):
         if not bool(torch.isfinite(cost(policy)).all()):
             raise ValueError(f"start: costs infinitely much in domain {d}, must be finite")
-
-
-def _check_spurious(spurious: Tensor) -> None:
-    if spurious.dim() != 2 or spurious.shape[1] < 2:
-        raise ValueError(
-            f"spurious: has shape {tuple(spurious.shape)}, must be [problems, domains] "
-            "with at least 2 domains"
-        )
-    if not bool(torch.isfinite(spurious).all()):
-        raise ValueError("spurious: holds NaN or infinite coefficients, must be finite")

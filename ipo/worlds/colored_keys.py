@@ -6,13 +6,14 @@ colour as an argument; grid, rules, view, reward and horizon are MiniGrid's.
 
 from __future__ import annotations
 
-from typing import Any
+from functools import partial
+from typing import Annotated, Any
 
 from minigrid.core.constants import COLOR_TO_IDX
 from minigrid.core.world_object import Door
 from minigrid.envs.doorkey import DoorKeyEnv
 
-from ipo.checks import check_choice, check_count
+from ipo.checks import Count, check_count, checked, one_of
 
 COLORS = tuple(COLOR_TO_IDX)  # red, green, blue, purple, yellow, grey: codes 0 to 5
 SMALLEST = 5  # two rooms of one column each
@@ -36,13 +37,14 @@ class ColoredKeysEnv(DoorKeyEnv):
         TypeError, ValueError: a size below 5 or not whole, an unknown colour.
     """
 
+    @checked
     def __init__(
-        self, size: int = 5, color: str = "grey", max_steps: int | None = None, **kwargs: Any
+        self,
+        size: Annotated[int, partial(check_count, minimum=SMALLEST)] = 5,
+        color: Annotated[str, one_of(COLORS)] = "grey",
+        max_steps: Count | None = None,
+        **kwargs: Any,
     ) -> None:
-        check_count("size", size, minimum=SMALLEST)
-        check_choice("color", color, COLORS)
-        if max_steps is not None:
-            check_count("max_steps", max_steps)
         self.color = color
         super().__init__(size=size, max_steps=max_steps, **kwargs)
 

@@ -10,15 +10,15 @@ The state is that of 7 joints: the wrist's x, y, z, its angles about z, y and x,
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
-from typing import Any, ClassVar, Protocol
+from typing import Annotated, Any, ClassVar, Protocol
 
 import gymnasium as gym
 import mujoco
 import numpy as np
 
-from ipo.checks import check_count, check_number
+from ipo.checks import Count, Positive, Seed, check_number, checked
 
 TIMESTEP, NUM_SUBSTEPS = 0.004, 5  # 50 actions a second; the published runs simulate 0.001 x 20
 MAX_STEPS = 512  # an episode lasts 10.24 s
@@ -46,6 +46,8 @@ RANGES = ((-3, 3), (-3, 3), (-3, 3), (-1.57, 1.57), (-1.57, 1.57), (0, 3.13))
 # Where an episode begins: five joints, the last one, and the handle's shift in y and in z.
 START_LOW = np.array([-0.3] * 5 + [0.0] + [-0.10, -0.15])
 START_HIGH = np.array([0.3] * 5 + [3.13] + [0.15, 0.0])
+
+Shift = Annotated[Sequence[float] | np.ndarray, "2"]  # of a handle along y and z, in m
 
 
 @dataclass(frozen=True)
@@ -106,11 +108,8 @@ class DoorParams:
 
     def __post_init__(self) -> None:
         for field in fields(self):
-            value = getattr(self, field.name)
             low, high = self.LIMITS[field.name]
-            check_number(field.name, value, least=low)
-            if value > high:
-                raise ValueError(f"{field.name} = {value!r}: must be at most {high}")
+            check_number(field.name, getattr(self, field.name), least=low, most=high)
         for name in ("handle_depth", "handle_half_length"):
             if self.handle_fillet >= getattr(self, name):
                 raise ValueError(
@@ -119,6 +118,7 @@ class DoorParams:
                 )
 
     @classmethod
+    @checked
     def sample(cls, generator: np.random.Generator, friction: float = 0.0) -> DoorParams:
         """A random door, which but for its friction does not depend on the friction.
 
@@ -184,8 +184,9 @@ class DoorParams:
         return np.array([self.handle_depth - F + rho * np.sin(np.pi / 8), 0.0, 0.0])
 
 
+@checked
 def build_door(
-    params: DoorParams, timestep: float = TIMESTEP, handle_shift: tuple[float, float] = (0.0, 0.0)
+    params: DoorParams, timestep: Positive = TIMESTEP, handle_shift: Shift = (0.0, 0.0)
 ) -> mujoco.MjSpec:
     """The robot in front of a door, to be compiled: bodies ``wrist``, ``door`` and ``handle``.
 
@@ -195,7 +196,6 @@ def build_door(
         handle_shift: of the handle along y and z, in m. To shift it later, set ``body_pos`` of
             the body, never the ``geom_pos``, from which MuJoCo has built its search trees.
     """
-    check_number("timestep", timestep, above=0)
     spec = mujoco.MjSpec()
     spec.modelname = "door"
     spec.compiler.degree = False
@@ -274,9 +274,7 @@ def _add_panel(spec: mujoco.MjSpec, params: DoorParams) -> mujoco.MjsBody:
     return door
 
 
-def _add_handle(
-    door: mujoco.MjsBody, params: DoorParams, handle_shift: tuple[float, float]
-) -> None:
+def _add_handle(door: mujoco.MjsBody, params: DoorParams, handle_shift: Shift) -> None:
     """A round bar on two standoffs, with a bend of two straight pieces at each end."""
     shift = np.array([0.0, *handle_shift])
     handle = door.add_body(name="handle", pos=params.handle_position + shift)
@@ -363,7 +361,7 @@ def observe(
     return observation, reward(qpos[..., 6], distance, R)
 
 
-def lever(params: DoorParams, handle_shift: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def lever(params: DoorParams, handle_shift: Shift) -> tuple[np.ndarray, np.ndarray]:
     """The hinge's position at the handle's height, and the arm from there to the target."""
     to_hinge = np.array([0.0, params.lever_arm, 0.0])
     shift = np.array([0.0, *handle_shift])
@@ -377,7 +375,7 @@ def draw_start(generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     return np.append(start[:6], 0.0), start[6:]
 
 
-def shift_handle(model: mujoco.MjModel, params: DoorParams, handle_shift: np.ndarray) -> None:
+def shift_handle(model: mujoco.MjModel, params: DoorParams, handle_shift: Shift) -> None:
     """Put a compiled door's handle in its place for an episode."""
     model.body("handle").pos = params.handle_position + np.array([0.0, *handle_shift])
 
@@ -420,12 +418,13 @@ class DoorEnv(gym.Env):
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 50}  # noqa: RUF012  (as gymnasium)
 
+    @checked
     def __init__(
         self,
         friction: float | None = None,
         params: DoorParams | None = None,
-        max_steps: int = MAX_STEPS,
-        timestep: float = TIMESTEP,
+        max_steps: Count = MAX_STEPS,
+        timestep: Positive = TIMESTEP,
         render_mode: str | None = None,
         draw: Callable[[DoorParams], Picture] | None = None,
     ) -> None:
@@ -435,7 +434,6 @@ class DoorEnv(gym.Env):
             raise ValueError(f"render_mode = {render_mode!r}: must be 'rgb_array' or None")
         if render_mode is not None and draw is None:
             raise ValueError(f"render_mode = {render_mode!r}: must come with draw")
-        check_count("max_steps", max_steps)
         self.friction = DoorParams(friction=0.0 if friction is None else friction).friction
         self.given, self.max_steps = params, max_steps
         self.render_mode, self.draw = render_mode, draw
@@ -446,8 +444,9 @@ class DoorEnv(gym.Env):
         self.step_count = 0
         self._picture: Picture | None = None
 
+    @checked
     def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+        self, *, seed: Seed | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
         super().reset(seed=seed)
         params = self.params
@@ -469,9 +468,9 @@ class DoorEnv(gym.Env):
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         if self.params is None:
             raise gym.error.ResetNeeded("reset() must come before step()")
-        action = np.asarray(action, dtype=np.float64)
-        check_actions(action[None], self.step_count)
-        self.data.ctrl[:] = action
+        if self.step_count >= self.max_steps:
+            raise gym.error.ResetNeeded("the episode has ended: reset() must come before step()")
+        self.data.ctrl[:] = check_actions(np.asarray(action)[None], self.step_count)[0]
         mujoco.mj_step(self.model, self.data, self.num_substeps)
         self.step_count += 1
         check_states(self.data.qpos[None], self.data.qvel[None], self.step_count)
@@ -503,9 +502,9 @@ class DoorEnv(gym.Env):
         return {"door_angle": float(self.data.qpos[6]), "opened": bool(self.opened)}
 
 
-def substeps(timestep: float) -> int:
+@checked
+def substeps(timestep: Positive) -> int:
     """How many steps of the simulation an action lasts."""
-    check_number("timestep", timestep, above=0)
     number = round(TIMESTEP * NUM_SUBSTEPS / timestep)
     if number < 1 or abs(number * timestep - TIMESTEP * NUM_SUBSTEPS) > 1e-9:
         raise ValueError(
@@ -515,16 +514,19 @@ def substeps(timestep: float) -> int:
     return number
 
 
-def check_actions(actions: np.ndarray, step: int) -> None:
-    """Refuse actions ``[N, 6]`` that are not finite."""
+def check_actions(actions: np.ndarray, step: int) -> np.ndarray:
+    """Actions ``[N, 6]`` in double precision; refuses those that are not finite numbers."""
     if actions.shape[1:] != (6,):
-        raise ValueError(f"action has shape {actions.shape[1:]}, must be (6,)")
+        raise ValueError(f"action: has shape {actions.shape[1:]}, must have (6,)")
+    if actions.dtype.kind not in "fiu":
+        raise TypeError(f"action: holds {actions.dtype}, must hold real numbers")
     finite = np.isfinite(actions).all(1)
     if not finite.all():
         door = int(np.flatnonzero(~finite)[0])
         raise ValueError(
             f"action = {actions[door].tolist()} of door {door} in step {step}: must be finite"
         )
+    return actions.astype(np.float64, copy=False)
 
 
 def check_states(qpos: np.ndarray, qvel: np.ndarray, step: int) -> None:

@@ -7,10 +7,12 @@ some of the paper's policies do.
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import numpy as np
 
-from ipo.checks import check_choice
-from ipo.worlds.door import ANCHOR, GEAR, WRIST, DoorParams, hook_rotation, lever
+from ipo.checks import checked, one_of
+from ipo.worlds.door import ANCHOR, GEAR, WRIST, DoorParams, Shift, hook_rotation, lever
 
 # Where the handle's bar is wanted, in the wrist's frame, one place after the other. ``inside``: in
 # front of the hook and beside it, level with its mouth, which opens towards -y, then in the mouth.
@@ -33,11 +35,12 @@ class Hooking:
             behind the handle: it works where ``handle_depth`` is near its maximum.
     """
 
-    def __init__(self, side: str = "inside") -> None:
-        check_choice("side", side, WAYPOINTS)
+    @checked
+    def __init__(self, side: Annotated[str, one_of(WAYPOINTS)] = "inside") -> None:
         self.waypoints, self.turned = WAYPOINTS[side], TURNED[side]
 
-    def begin(self, params: DoorParams, handle_shift: np.ndarray) -> None:
+    @checked
+    def begin(self, params: DoorParams, handle_shift: Shift) -> None:
         self.hinge, arm = lever(params, handle_shift)
         # To the bar's axis, instead of the point that is rewarded.
         to_axis = params.handle_depth - params.target_position[0]

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict
-from typing import Any
+from typing import Annotated, Any
 
 import gymnasium as gym
 import mujoco
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from ipo.checks import check_count
+from ipo.checks import Count, Positive, Seed, checked
 from ipo.worlds.door import (
     MAX_STEPS,
     OPENED,
@@ -54,15 +54,14 @@ class VectorDoor(gym.vector.VectorEnv):
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012  (as gymnasium has it)
 
+    @checked
     def __init__(
         self,
-        doors: Sequence[float | DoorParams],
-        max_steps: int = MAX_STEPS,
-        timestep: float = TIMESTEP,
+        doors: Annotated[Sequence[float | DoorParams], "N"],
+        max_steps: Count = MAX_STEPS,
+        timestep: Positive = TIMESTEP,
     ) -> None:
         self.given = list(doors)
-        check_count("the number of doors", len(self.given))
-        check_count("max_steps", max_steps)
         self.num_envs, self.max_steps = len(self.given), max_steps
         self.timestep, self.num_substeps = timestep, substeps(timestep)
         self.frictions = [
@@ -78,8 +77,9 @@ class VectorDoor(gym.vector.VectorEnv):
         self.step_count = 0
         self.episodes: list[tuple[np.ndarray, np.ndarray]] = []
 
+    @checked
     def reset(
-        self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
+        self, *, seed: Seed | Sequence[Seed] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Begin episodes. A seed is a list of one for each door; one number is spread over them.
 
@@ -101,12 +101,12 @@ class VectorDoor(gym.vector.VectorEnv):
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """One step of every door, and a new beginning after the last one of the episodes."""
         self._check_reset("step()")
-        actions = np.asarray(actions, dtype=np.float64)
+        actions = np.asarray(actions)
         if actions.shape != self.action_space.shape:
             raise ValueError(
-                f"actions have shape {actions.shape}, must be {self.action_space.shape}"
+                f"actions: have shape {actions.shape}, must have {self.action_space.shape}"
             )
-        check_actions(actions, self.step_count)
+        actions = check_actions(actions, self.step_count)
         rewards = self.next_rewards
         for model, data, ctrl, action in zip(
             self.models, self.data, self.ctrl, actions, strict=True
@@ -144,8 +144,11 @@ class VectorDoor(gym.vector.VectorEnv):
             "opened": self.opened.copy(),
         }
 
+    @checked
     def restore(self, state: dict[str, Any]) -> None:
         """Go on from ``state()`` of as many doors."""
+        if len(state["params"]) != self.num_envs:
+            raise ValueError(f"state: of {len(state['params'])} doors, must be of {self.num_envs}")
         self._build([DoorParams(**params) for params in state["params"]])
         self.generators = [np.random.default_rng() for _ in self.params]
         for generator, own in zip(self.generators, state["generators"], strict=True):

@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 import mujoco
 import numpy as np
 
+from ipo.checks import Probability, checked
 from ipo.worlds.door import FINGER, TUBES, DoorEnv
 
 # Where the inside of the hook lies, seen from a tube's axis, in the wrist's frame. The hook hangs
@@ -67,6 +68,7 @@ def is_inside(geom: str, point: np.ndarray) -> bool:
     return bool((point - center) @ INSIDE[geom] > 0)
 
 
+@checked
 def strategy(
     env: DoorEnv, act: Callable[[np.ndarray], np.ndarray], observation: np.ndarray
 ) -> tuple[str, float]:
@@ -93,14 +95,16 @@ def strategy(
     return strategy_of_part(part), part
 
 
-def strategy_of_part(part: float) -> str:
+@checked
+def strategy_of_part(part: Probability) -> str:
     """The name for an episode in which the inside of the hook did so much of the pull."""
     if part >= HOOK:
         return "hook"
     return "outside" if part <= OUTSIDE else "mixed"
 
 
-def strategy_of_policy(parts: Sequence[float]) -> str:
+@checked
+def strategy_of_policy(parts: Sequence[Probability]) -> str:
     """The name for a policy, from the ``parts`` of the doors that it opened."""
     names = [strategy_of_part(part) for part in parts]
     for name in ("hook", "outside"):

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -20,6 +20,8 @@ from minigrid.minigrid_env import MiniGridEnv
 from torch import Tensor
 from tqdm import tqdm
 
+from ipo.checks import Count, Natural, check_count, checked
+from ipo.distributions import Generators
 from ipo.rollouts import Step
 
 
@@ -27,6 +29,7 @@ class NotTabularError(ValueError):
     """An environment that a table cannot describe."""
 
 
+@checked
 @dataclass(frozen=True)
 class TabularTask:
     """A finite deterministic task: S states, A actions, K distinct observations, horizon T.
@@ -45,23 +48,37 @@ class TabularTask:
         signature: ``[S]``, by which :func:`state_of` finds the state that MiniGrid is in.
     """
 
-    next_state: np.ndarray
-    goal: np.ndarray
-    done: np.ndarray
-    goal_reward: np.ndarray
-    start: np.ndarray
-    observation: np.ndarray
-    images: np.ndarray
-    progress: np.ndarray
-    position: np.ndarray
-    signature: np.ndarray
+    next_state: Annotated[np.ndarray, "S A"]
+    goal: Annotated[np.ndarray, "S A"]
+    done: Annotated[np.ndarray, "S A"]
+    goal_reward: Annotated[np.ndarray, "T"]
+    start: Annotated[np.ndarray, "S"]
+    observation: Annotated[np.ndarray, "S"]
+    images: Annotated[np.ndarray, "K ..."]
+    progress: Annotated[np.ndarray, "S"]
+    position: Annotated[np.ndarray, "S 2"]
+    signature: Annotated[np.ndarray, "S"]
 
     @property
     def horizon(self) -> int:
         return len(self.goal_reward)
 
+    @property
+    def sizes(self) -> dict[str, int]:
+        S, A = self.next_state.shape
+        return {"S": S, "A": A, "K": len(self.images)}
 
-def tabulate(env: Env, max_states: int = 100_000) -> TabularTask:
+
+def _check_policy(name: str, policy: np.ndarray) -> None:
+    if bool((policy < 0).any()) or not np.allclose(policy.sum(-1), 1, atol=1e-3):
+        raise ValueError(f"{name}: must hold probabilities, whose sum over actions is 1")
+
+
+Policies = Annotated[np.ndarray, "P K A", _check_policy]
+
+
+@checked
+def tabulate(env: Env, max_states: Count = 100_000) -> TabularTask:
     """Breadth-first search over all states of a MiniGrid task, from every possible start.
 
     Raises:
@@ -97,6 +114,7 @@ def tabulate(env: Env, max_states: int = 100_000) -> TabularTask:
     )
 
 
+@checked
 def goal_reward(env: Env) -> np.ndarray:
     """What MiniGrid gives for reaching the goal in step 1, 2, ... T; ``reset`` must follow."""
     env = _minigrid(env)
@@ -107,6 +125,7 @@ def goal_reward(env: Env) -> np.ndarray:
     return rewards
 
 
+@checked
 def state_of(task: TabularTask, env: Env) -> int:
     """The state of the table that a MiniGrid environment is in.
 
@@ -127,7 +146,11 @@ class TabularDomains:
         observation_of: for each domain, the index in ``images`` of its own observations.
     """
 
-    def __init__(self, tasks: Sequence[TabularTask]) -> None:
+    @checked
+    def __init__(self, tasks: Annotated[Sequence[TabularTask], "E"]) -> None:
+        for d, task in enumerate(tasks):
+            if not np.array_equal(task.goal_reward, tasks[0].goal_reward):
+                raise ValueError(f"tasks[{d}]: has other goal rewards, must have those of tasks[0]")
         everything = np.concatenate([task.images for task in tasks])
         self.images, index = np.unique(everything, axis=0, return_inverse=True)
         self.observation_of = np.split(index, np.cumsum([len(task.images) for task in tasks])[:-1])
@@ -146,13 +169,15 @@ class TabularDomains:
         self.first_start = np.array([own[0] + n for own, n in zip(possible, first, strict=False)])
         self.last_start = np.array([own[-1] + n for own, n in zip(possible, first, strict=False)])
 
+    @checked
     def __call__(
         self,
-        domains: Sequence[int],
-        num_copies: Sequence[int],
-        generators: Sequence[np.random.Generator],
+        domains: Annotated[Sequence[Natural], "d"],
+        num_copies: Annotated[Sequence[Count], "d"],
+        generators: Annotated[Generators, "R"],
     ) -> TabularEnvironments:
         """``num_copies`` of each of ``domains``, for one run per generator."""
+        check_count("domains", max(domains), 0, len(self.observation_of) - 1)
         return TabularEnvironments(self, np.repeat(domains, num_copies), generators)
 
 
@@ -160,10 +185,7 @@ class TabularEnvironments:
     """``[R, N]`` copies that begin anew when they end: ``rollouts.Environments``."""
 
     def __init__(
-        self,
-        table: TabularDomains,
-        domains: np.ndarray,
-        generators: Sequence[np.random.Generator],
+        self, table: TabularDomains, domains: np.ndarray, generators: Sequence[np.random.Generator]
     ) -> None:
         self.table, self.domains, self.generators = table, domains, generators
 
@@ -201,7 +223,8 @@ class TabularEnvironments:
         )
 
 
-def expected_return(task: TabularTask, policy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+@checked
+def expected_return(task: TabularTask, policy: Policies) -> tuple[np.ndarray, np.ndarray]:
     """Expected return and success probability of policies, by dynamic programming.
 
         V_t(s) = sum_a pi(a | s) [ r_t 1{goal} + 1{not done} V_(t+1)(s') ],    V_T = 0
@@ -225,22 +248,21 @@ def expected_return(task: TabularTask, policy: np.ndarray) -> tuple[np.ndarray, 
     return returns, success
 
 
-def reach(task: TabularTask, policy: np.ndarray, states: np.ndarray) -> np.ndarray:
+@checked
+def reach(task: TabularTask, policy: Policies, states: Annotated[np.ndarray, "S"]) -> np.ndarray:
     """Probability ``[P]`` that policies ``[P, K, A]`` ever come to one of ``states [S]``.
 
     Within the horizon; ``states`` are true where the search ends.
     """
     entered = states[task.next_state] & ~task.done
     goal = replace(
-        task,
-        goal=entered,
-        done=task.done | entered,
-        start=np.where(states, 0.0, task.start),
+        task, goal=entered, done=task.done | entered, start=np.where(states, 0.0, task.start)
     )
     return expected_return(goal, policy)[1] + float(task.start @ states)
 
 
-def occupancy(task: TabularTask, policy: np.ndarray) -> np.ndarray:
+@checked
+def occupancy(task: TabularTask, policy: Policies) -> np.ndarray:
     """Expected number of steps ``[P, S]`` that policies ``[P, K, A]`` spend in each state.
 
     mu_(t+1)(s') = sum_(s, a) mu_t(s) pi(a | s) 1{not done},    summed over t < T
@@ -257,6 +279,7 @@ def occupancy(task: TabularTask, policy: np.ndarray) -> np.ndarray:
     return total
 
 
+@checked
 def optimal_policy(task: TabularTask) -> tuple[np.ndarray, float]:
     """Best action ``[T, S]`` for every step and state, and its expected return.
 

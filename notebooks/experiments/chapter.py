@@ -20,6 +20,7 @@ from experiments.experiment import Cell, Experiment, Places, rebuilt
 from experiments.origin import ROOT
 from experiments.paper import read_paper
 from experiments.store import Store, timed
+from ipo.checks import Count, checked
 
 
 class Chapter:
@@ -34,12 +35,13 @@ class Chapter:
         num_workers: processes that compute missing rows; ``None``: one per core.
     """
 
+    @checked
     def __init__(
         self,
         name: str,
         experiments: Mapping[str, Experiment],
         results_dir: str | None,
-        num_workers: int | None = None,
+        num_workers: Count | None = None,
     ) -> None:
         plt.rcParams.update(figures.STYLE)
         torch.set_num_threads(1)  # small matrices: processes use the cores better than threads

@@ -10,12 +10,16 @@ import types
 import typing
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Annotated, Any, Protocol, runtime_checkable
 
 import pandas as pd
 
+from ipo.checks import Count, check_counts, checked
 
+
+@runtime_checkable
 class Cell(Protocol):
     """What identifies a batch of runs: a frozen dataclass whose ``columns`` name its rows."""
 
@@ -44,6 +48,7 @@ class Places:
         return functools.partial(function, **folders) if folders else function
 
 
+@checked
 @dataclass(frozen=True)
 class Experiment:
     """How rows are made of cells.
@@ -66,9 +71,9 @@ class Experiment:
     run: Callable[..., pd.DataFrame]
     cell: type
     short: Callable[[Any], Any | None] = lambda cell: cell
-    seeds: tuple[int, ...] = (0, 1)
+    seeds: Annotated[tuple[int, ...], partial(check_counts, minimum=0)] = (0, 1)
     reads: Callable[..., list[Path]] | None = None
-    runs_at_once: int | None = None
+    runs_at_once: Count | None = None
     checkpoints: Callable[..., list[Path]] | None = None
 
     def at(self, places: Places) -> Experiment:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import pandas as pd
@@ -22,7 +22,7 @@ from experiments.policies import check_place, load_policy, save_policy
 from experiments.rows import tidy
 from experiments.tables import mean_and_std
 from experiments.tabulated import load_or_tabulate
-from ipo.checks import check_choice
+from ipo.checks import Count, check_choice, checked, one_of
 from ipo.distributions import Categorical
 from ipo.networks import GridNetwork, OnTable, Weights
 from ipo.ppo import PPOSettings, Training
@@ -55,6 +55,7 @@ def published(method: str, **changes: Any) -> PPOSettings:
     return PPOSettings(method, **(paper | changes))
 
 
+@checked
 @dataclass(frozen=True)
 class Cell:
     """One configuration of the experiment.
@@ -71,12 +72,11 @@ class Cell:
     label: str
     settings: PPOSettings
     train_colors: tuple[str, ...] = TRAINED
-    color_encoding: str = "integer"
-    size: int = 5
+    color_encoding: Annotated[str, one_of(ENCODINGS)] = "integer"
+    size: Count = 5
 
     def __post_init__(self) -> None:
         check_file_name("label", self.label)  # of policies
-        check_choice("color_encoding", self.color_encoding, ENCODINGS)
         for color in self.train_colors:
             check_choice("train_colors", color, COLORS)
         if not self.train_colors:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import pandas as pd
@@ -16,7 +16,7 @@ from experiments.figures import label
 from experiments.rows import tidy
 from experiments.store import select
 from experiments.tables import mean_and_std
-from ipo.checks import check_count
+from ipo.checks import Count, check_count, checked, one_of
 from ipo.game import nash_gap
 from ipo.lqr import (
     LQR,
@@ -36,6 +36,7 @@ from ipo.stats import paired_difference, probability_of_improvement
 VALIDATION_INTERVAL = 20  # iterations between two looks at the held-out domain
 
 
+@checked
 @dataclass(frozen=True)
 class Cell:
     """One configuration of the experiment.
@@ -52,11 +53,11 @@ class Cell:
     """
 
     label: str
-    num_domains: int
-    dim_distractor: int
+    num_domains: Count
+    dim_distractor: Count
     settings: LQRSettings | None
     early_stopping: bool = False
-    precision: str = "float32"
+    precision: Annotated[str, one_of(("float32", "float64"))] = "float32"
 
     @property
     def columns(self) -> dict[str, Any]:

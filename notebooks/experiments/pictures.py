@@ -20,7 +20,7 @@ import numpy as np
 from gymnasium import Env
 from matplotlib.figure import Figure
 
-from ipo.checks import check_choice
+from ipo.checks import Count, check_choice, checked
 from ipo.worlds.door import DoorParams, build_door, shift_handle
 from ipo.worlds.tabular import TabularTask, state_of
 
@@ -125,8 +125,9 @@ class DoorPicture:
         RenderError: no OpenGL without a display (EGL) on this machine.
     """
 
+    @checked
     def __init__(
-        self, params: DoorParams, width: int = 640, height: int = 480, camera: str = "room"
+        self, params: DoorParams, width: Count = 640, height: Count = 480, camera: str = "room"
     ) -> None:
         check_choice("camera", camera, CAMERAS)
         self.params = params

@@ -23,7 +23,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import pandas as pd
 from filelock import FileLock
@@ -35,13 +35,20 @@ from experiments.files import check_file_name, replace_text
 from experiments.rows import ResultsError, check_rows, types_of
 from experiments.sealed import digest_of
 from experiments.work import finished
-from ipo.checks import check_counts
+from ipo.checks import Seeds, check_count, checked
 
 KEYS = {"columns", "cell", "run", "options", "seeds", "reads", "num_rows", "sha256"}  # of a batch
 TYPES = {"str": str, "bool": bool, "int64": int, "float64": float}  # a bool is an int, too
 NO_ROWS = pd.DataFrame({"run": pd.Series(dtype=int)})
 
 Batch = dict[str, Any]
+
+
+def _check_workers(name: str, value: object) -> None:
+    """As joblib counts them: -1 are as many as there are cores."""
+    check_count(name, value, minimum=None)
+    if value == 0:
+        raise ValueError(f"{name} = 0: must be a number of processes, or -1 for one per core")
 
 
 class OriginError(ResultsError):
@@ -87,12 +94,13 @@ class Store:
         rows = self.rows()
         return select(rows[rows["run"].isin(batch["seeds"])], batch["columns"])
 
+    @checked
     def fill(
         self,
         experiment: Experiment,
-        cells: Sequence[Cell],
-        seeds: Sequence[int],
-        num_workers: int | None = None,
+        cells: Annotated[Sequence[Cell], "cells"],
+        seeds: Seeds,
+        num_workers: Annotated[int, _check_workers] | None = None,
         scheduler: str | None = None,
     ) -> pd.DataFrame:
         """The rows of ``cells`` x ``seeds``: loaded where they exist, computed where they do not.
@@ -114,7 +122,6 @@ class Store:
             OriginError: rows of another cell, option, run function or input than asked for.
             WorkError: a scheduler that cannot be reached or is lost.
         """
-        check_counts("seeds", seeds, minimum=0)
         rows, batches = self._read()
         size = experiment.runs_at_once or len(seeds)
         lacking = [(cell, self._missing(experiment, cell, seeds, batches)) for cell in cells]

@@ -300,41 +300,16 @@ def test_a_given_door_stays():
 # --------------------------------------------------------------------------------- bad input
 
 
-@pytest.mark.parametrize(
-    ("change", "error"),
-    [
-        ({"friction": -0.1}, "friction = -0.1: must be at least 0"),
-        ({"friction": NAN}, "friction = nan: must not be NaN"),
-        ({"friction": math.inf}, "friction = inf: must be at most 100"),
-        ({"height": 0.0}, "height = 0.0: must be at least 1.2"),
-        ({"width": -1.0}, "width = -1.0: must be at least 0.3"),
-        ({"thickness": 1.0}, "thickness = 1.0: must be at most 0.2"),
-        ({"handle_ratio": 0.9}, "handle_ratio = 0.9: must be at most 0.5"),
-        ({"density": 0.0}, "density = 0.0: must be at least 10"),
-        ({"hinge_damping": -1.0}, "hinge_damping = -1.0: must be at least 0"),
-        ({"handle_diameter": 0.1}, "handle_diameter = 0.1: must be at most 0.04"),
-        ({"handle_fillet": 0.1}, "handle_fillet = 0.1: must be less than handle_depth = 0.095"),
-    ],
-)
-def test_a_door_that_cannot_be_is_refused(change, error):
-    with pytest.raises(ValueError, match=f"^{error}"):
-        DoorParams(**change)
-
-
-def test_a_friction_that_is_no_number_is_refused():
-    with pytest.raises(TypeError, match="friction = 'high': must be a number, not str"):
-        DoorEnv(friction="high")
+def test_a_handle_that_cannot_be_is_refused():
+    with pytest.raises(ValueError, match=r"^handle_fillet = 0.1: must be less than handle_depth ="):
+        DoorParams(handle_fillet=0.1)
 
 
 @pytest.mark.parametrize(
     ("arguments", "error"),
     [
-        ({"friction": -1.0}, "friction = -1.0: must be at least 0"),
         ({"friction": 0.1, "params": DoorParams()}, "friction = 0.1: must not be given beside"),
-        ({"max_steps": 0}, "max_steps = 0: must be at least 1"),
-        ({"timestep": 0.0}, "timestep = 0.0: must be greater than 0"),
         ({"timestep": 0.003}, "timestep = 0.003: a whole number of them must make 0.02 s"),
-        ({"render_mode": "human"}, "render_mode = 'human': must be 'rgb_array' or None"),
         ({"render_mode": "rgb_array"}, "render_mode = 'rgb_array': must come with draw"),
     ],
 )
@@ -343,19 +318,12 @@ def test_an_environment_that_makes_no_sense_is_refused(arguments, error):
         DoorEnv(**arguments)
 
 
-@pytest.mark.parametrize(
-    ("doors", "options", "error"),
-    [
-        ([], {}, "the number of doors = 0: must be at least 1"),
-        ([0.0, -2.0], {}, "friction = -2.0: must be at least 0"),
-        ([0.0], {"max_steps": 0}, "max_steps = 0: must be at least 1"),
-        ([0.0], {"timestep": -0.1}, "timestep = -0.1: must be greater than 0"),
-        ([0.0], {"timestep": 0.003}, "timestep = 0.003: a whole number of them must make 0.02 s"),
-    ],
-)
-def test_doors_that_make_no_sense_are_refused(doors, options, error):
-    with pytest.raises(ValueError, match=f"^{error}"):
-        VectorDoor(doors, **options)
+def test_steps_after_the_end_are_refused():
+    env = DoorEnv(max_steps=1)
+    env.reset(seed=0)
+    env.step(np.zeros(6))
+    with pytest.raises(gym.error.ResetNeeded, match="the episode has ended"):
+        env.step(np.zeros(6))
 
 
 def test_steps_before_a_reset_are_refused():
@@ -365,21 +333,6 @@ def test_steps_before_a_reset_are_refused():
         VectorDoor([0.0]).step(np.zeros((1, 6)))
     with pytest.raises(gym.error.ResetNeeded):
         VectorDoor([0.0]).state()
-
-
-def test_seeds_for_other_doors_are_refused():
-    with pytest.raises(ValueError, match="names 3 seeds, must be 2"):
-        VectorDoor([0.0, 0.1]).reset(seed=[1, 2, 3])
-
-
-def test_actions_of_another_shape_are_refused():
-    doors, env = VectorDoor([0.0, 0.1]), DoorEnv()
-    doors.reset(seed=0)
-    env.reset(seed=0)
-    with pytest.raises(ValueError, match=r"shape \(2, 5\), must be \(2, 6\)"):
-        doors.step(np.zeros((2, 5)))
-    with pytest.raises(ValueError, match=r"shape \(5,\), must be \(6,\)"):
-        env.step(np.zeros(5))
 
 
 @pytest.mark.parametrize("bad", [NAN, math.inf])

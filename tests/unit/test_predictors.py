@@ -1,6 +1,5 @@
 """Invariance methods: derivatives, limits, ICP against another implementation, bad input."""
 
-import math
 from dataclasses import replace
 
 import causalicp
@@ -30,7 +29,6 @@ from ipo.causality.predictors import (
     Regression,
     erm,
     irm_game_fixed_phi,
-    irm_game_variable_phi,
     irm_penalties,
     irmv1,
     vrex,
@@ -134,13 +132,6 @@ def test_game_of_two_opposed_domains_drops_the_effect():
     settings = PredictorSettings(learning_rate=0.01, num_iterations=3000, bound=2.0)
     v = irm_game_fixed_phi(task, settings)
     assert v[0].tolist() == pytest.approx([1.0, 0.0], abs=0.02)
-
-
-def test_game_needs_two_domains():
-    task = population_task([1.0])
-    for method in (irm_game_fixed_phi, irm_game_variable_phi):
-        with pytest.raises(ValueError, match="number of domains = 1: must be at least 2"):
-            method(task, FAST)
 
 
 @pytest.mark.parametrize("method", PREDICTOR_METHODS.values(), ids=PREDICTOR_METHODS.keys())
@@ -270,35 +261,11 @@ X, Y = torch.randn(1, 5, 2).double(), torch.zeros(1, 5).double()
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: Regression.from_samples([], []), "features = \\[\\]: must hold at least 1 domain"),
-        (lambda: Regression.from_samples([X, X], [Y]), "targets: of 1 domains, must be of 2"),
         (
-            lambda: Regression.from_samples([X, X[..., :1]], [Y, Y]),
-            "features\\[1\\]: has 1 features, must have 2 as in domain 0",
+            lambda: icp([X[0, :1]] * 2, [Y[0, :1]] * 2),
+            "samples of a domain = 1: must be",
         ),
-        (lambda: Regression.from_samples([X], [Y[:, :4]]), "targets\\[0\\]: has shape \\(1, 4\\)"),
-        (lambda: Regression.from_samples([X[:, :0]], [Y[:, :0]]), "features\\[0\\]: has 0 samples"),
-        (lambda: Regression.from_samples([X * math.nan], [Y]), "features\\[0\\]: holds NaN"),
-        (
-            lambda: Classification([X, X], [Y, Y * math.inf]),
-            "targets\\[1\\]: holds NaN or infinite",
-        ),
-        (lambda: icp([X[0]], [Y[0]]), "number of domains = 1: must be at least 2"),
-        (lambda: icp([X[0], X[0]], [Y[0], Y[0]], alpha=1.0), "alpha = 1.0: must be below 1"),
-        (lambda: icp([X[0], X[0]], [Y[0], Y[0]], alpha=0.0), "alpha = 0.0: must be greater than 0"),
-        (
-            lambda: icp([torch.ones(5, 1).double()] * 2, [Y[0]] * 2),
-            "feature 0 = 1.0: must not be constant",
-        ),
-        (lambda: PredictorSettings(penalty=-1.0), "penalty = -1.0: must be at least 0"),
-        (lambda: PredictorSettings(ridge=-0.1), "ridge = -0.1: must be at least 0"),
-        (lambda: PredictorSettings(num_features=0), "num_features = 0: must be at least 1"),
-        (
-            lambda: PredictorSettings(learning_rate=0.0),
-            "learning_rate = 0.0: must be greater than 0",
-        ),
-        (lambda: PredictorSettings(bound=0.0), "bound = 0.0: must be greater than 0"),
-        (lambda: PredictorSettings(penalty=math.nan), "penalty = nan: must not be NaN"),
+        (lambda: icp([torch.ones(5, 1).double()] * 2, [Y[0]] * 2), "features: .* independent"),
         (lambda: Cell("ermm", "FOU", FAST), "method = 'ermm'.*did you mean 'erm'"),
         (lambda: Cell("erm", "FOX", FAST), "problem = 'FOX'.*must be one of"),
         (lambda: Cell("erm", "FOU", None), "settings = None: must be given"),

@@ -159,7 +159,7 @@ def test_the_right_conditional_is_found_to_change():
 def test_p_values_are_uniform_where_nothing_changes():
     p = [
         same_conditional(
-            [CHAIN.sample(200, rng(2 * i)), CHAIN.sample(200, rng(2 * i + 1))], "Y", "X"
+            [CHAIN.sample(200, rng(2 * i)), CHAIN.sample(200, rng(2 * i + 1))], "Y", ["X"]
         )
         for i in range(200)
     ]
@@ -192,30 +192,18 @@ def test_drawn_graph_has_the_nodes_and_edges_of_the_model():
             lambda: SCM({"X1": Linear({}), "Y": Linear({"X2": 1})}),
             "parent of Y = 'X2': must be one of X1, Y",
         ),
-        (lambda: CHAIN.do(W=1.0), "intervention on = 'W': must be one of X, Y, Z"),
-        (lambda: CHAIN.with_noise(W=Normal()), "intervention on = 'W': must be one of"),
         (lambda: CHAIN.intervene(X=Linear({"Z": 1})), "is a cycle"),
-        (lambda: CHAIN.parents("Q"), "variable = 'Q': must be one of X, Y, Z"),
-        (lambda: CHAIN.sample(0, rng()), "num_samples = 0: must be at least 1"),
-        (lambda: CHAIN.sample(-2, rng()), "num_samples = -2: must be at least 1"),
-        (lambda: Normal(0, -1), "std = -1: must be at least 0"),
-        (lambda: Normal(math.nan, 1), "mean = nan: must not be NaN"),
-        (lambda: Linear({"X": math.nan}), "coefficients\\['X'\\] = nan: must not be NaN"),
         (
             lambda: SCM({"X": Mechanism((), lambda noise: 1.0)}).sample(3, rng()),
             "X: has shape \\(\\), must have \\(3,\\)",
         ),
         (
             lambda: SCM({"X": Mechanism((), lambda noise: noise * np.nan)}).sample(3, rng()),
-            "X: its assignment returned NaN",
+            "X: its assignment must return finite numbers",
         ),
         (
-            lambda: same_conditional([CHAIN.sample(9, rng())], "Y", ["X"]),
-            "samples: has 1 domains, must have at least 2",
-        ),
-        (
-            lambda: population_regression(moments(CHAIN)[1], "Y", ["W"]),
-            "variable = 'W': must be one of",
+            lambda: SCM({"X": bernoulli((), lambda: 2.0)}).sample(3, rng()),
+            "probability: returned other numbers, must be within",
         ),
         (
             lambda: plots.causal_graph(plt.figure().add_subplot(), CHAIN, {"X": (0, 0)}),
@@ -226,8 +214,3 @@ def test_drawn_graph_has_the_nodes_and_edges_of_the_model():
 def test_bad_input(make, message):
     with pytest.raises(ValueError, match=message):
         make()
-
-
-def test_exact_moments_need_a_linear_model():
-    with pytest.raises(TypeError, match="U: is a Mechanism, must be Linear"):
-        moments(BINARY)

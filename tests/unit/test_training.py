@@ -162,15 +162,8 @@ def test_players_with_unequal_rollouts_make_the_same_number_of_steps():
     [
         ({"num_envs": 5}, "num_envs = 5: must be a multiple of 2"),
         ({"num_envs": (4,)}, r"num_envs = \(4,\): must name a multiple of 1 for each of 2 domains"),
-        ({"num_envs": (4, 0)}, "num_envs = 0: must be at least 1"),
         ({"minibatch_size": 1000}, "minibatch_size = 1000: must be at most 32"),
         ({"num_minibatches": 33}, "num_minibatches = 33: must be at most 32"),
-        ({"num_minibatches": 0}, "num_minibatches = 0: must be at least 1"),
-        ({"adam_epsilon": 0.0}, "adam_epsilon = 0.0: must be greater than 0"),
-        ({"reward_clip": -1.0}, "reward_clip = -1.0: must be greater than 0"),
-        ({"discount": 1.5}, "discount = 1.5: must be at most 1"),
-        ({"time_outs": "terminate"}, "time_outs = 'terminate': .* did you mean 'terminal'"),
-        ({"normalize_advantages": True}, "normalize_advantages = True: must be one of none"),
     ],
 )
 def test_settings_that_make_no_sense_are_refused(change, error):

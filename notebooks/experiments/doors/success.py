@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import pandas as pd
@@ -26,7 +26,7 @@ from experiments.doors.training import (
     policy_path,
 )
 from experiments.experiment import Experiment
-from ipo.checks import check_choice, check_count
+from ipo.checks import Count, Natural, NonNegative, check_choice, check_count, checked
 from ipo.distributions import Gaussian
 from ipo.networks import Weights
 from ipo.worlds.door import DoorEnv, DoorParams
@@ -37,6 +37,7 @@ TEST_FRICTIONS = (1.1, 1.2, 1.3, 1.4, 1.5)  # of the paper's Table 4
 NUM_DOORS = 200
 
 
+@checked
 @dataclass(frozen=True)
 class Cell:
     """Policies of one method after so many updates, on so many doors.
@@ -51,11 +52,11 @@ class Cell:
     """
 
     trained: door_training.Cell
-    updates: int
+    updates: Count
     choice: str = "best"
-    player: int | None = None
-    frictions: tuple[float, ...] = TEST_FRICTIONS
-    num_doors: int = NUM_DOORS
+    player: Natural | None = None
+    frictions: Annotated[tuple[NonNegative, ...], "frictions"] = TEST_FRICTIONS
+    num_doors: Count = NUM_DOORS
 
     def __post_init__(self) -> None:
         if self.updates not in self.trained.saved_after:

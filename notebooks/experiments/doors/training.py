@@ -21,6 +21,7 @@ from experiments.checkpoints import CheckpointError, files_of, load_checkpoint, 
 from experiments.experiment import Experiment, plain
 from experiments.files import check_file_name
 from experiments.policies import check_place, load_policy, save_policy
+from ipo.checks import Count, checked
 from ipo.distributions import Gaussian
 from ipo.networks import DenseNetwork, Weights, copied
 from ipo.ppo import PPOSettings, Training
@@ -58,6 +59,7 @@ def published_door(method: str, **changes: Any) -> PPOSettings:
     return PPOSettings(method, **(paper | changes))
 
 
+@checked
 @dataclass(frozen=True)
 class Cell:
     """One configuration of the training.
@@ -72,8 +74,8 @@ class Cell:
 
     label: str
     settings: PPOSettings
-    saved_after: tuple[int, ...] = (95, 190)
-    curve_every: int = 10
+    saved_after: tuple[Count, ...] = (95, 190)
+    curve_every: Count = 10
 
     def __post_init__(self) -> None:
         check_file_name("label", self.label)  # of policies and check-points
