@@ -58,12 +58,15 @@ class ImageNetwork(DenseNetwork):
         x = observations / 255 if observations.dtype == torch.uint8 else observations
         if not self.channels_first:
             x = x.movedim(-1, 2)
-        num_runs = len(x)
-        x = x.transpose(0, 1).flatten(1, 2)  # [B, R C, H, W]: the runs are groups of channels
         for name in self.convolutions:
-            kernel = weights[f"{name}.weight"].transpose(1, 2).unflatten(2, (-1, 3, 3))
-            bias = weights[f"{name}.bias"].flatten()
-            x = conv2d(x, kernel.flatten(0, 1), bias, stride=2, padding=1, groups=num_runs).relu()
-        return super().__call__(weights, x.unflatten(1, (num_runs, -1)).flatten(2).transpose(0, 1))
+            x = self._convolved(x, weights[f"{name}.weight"], weights[f"{name}.bias"])
+        return super().__call__(weights, x.flatten(2))
+
+    @staticmethod
+    def _convolved(x: Tensor, matrices: Tensor, biases: Tensor) -> Tensor:
+        """``[R, B, C, H, W]``; run by run, which is faster than runs as groups of channels."""
+        runs = zip(x, matrices, biases, strict=True)
+        kernels = ((own, w.T.unflatten(1, (-1, 3, 3)), b) for own, w, b in runs)
+        return torch.stack([conv2d(own, k, b, stride=2, padding=1) for own, k, b in kernels]).relu()
 
     frozen = Network.frozen  # in torch: here convolutions take the time

@@ -193,10 +193,11 @@ def _returns(
         step = copies.step(policy.network.distribution.sample(parameters, generators))
         returns += running * step.reward
         ended = running & (step.terminated | step.truncated)
-        running &= ~ended
-        bar.update(int(ended.sum()))
-        if not running.any():
-            return returns
+        if ended.any():
+            running &= ~ended
+            bar.update(int(ended.sum()))
+            if not running.any():
+                return returns
         observation = step.observation
     raise ValueError(
         f"domain {copies.names[0]!r}: {int(running.sum())} of {running.numel()} episodes went on "
