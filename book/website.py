@@ -10,6 +10,7 @@ from pathlib import Path
 
 import nbformat
 
+import benchmarks
 import claims
 import provenance
 from execute import BuildError, Notebook, for_terminal, replace_text, tree_hash
@@ -49,6 +50,7 @@ def stage(root: Path, source: Path, notebooks: list[Notebook], profile: str) -> 
     (source / "run_times.md").write_text(run_times_page(notebooks, profile), encoding="utf-8")
     claims.write_fragments(source)
     provenance.write_fragment(source)
+    benchmarks.write_fragment(source)
 
 
 def run_jupyter_book(source: Path, output: Path) -> Path:

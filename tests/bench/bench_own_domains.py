@@ -3,28 +3,31 @@
     python tests/bench/bench_own_domains.py [--frames 61440] [--seeds 3] [--json PATH]
 
 Stable-baselines3 is no dependency of the project: `pip install stable-baselines3`. One thread
-each, and as many frames. It is measured with its own defaults, and with our settings (copies,
-steps, epochs, minibatch, rates, scaled rewards), where both do the same amount of work. The arms
-take turns, seed by seed, so that a busy machine slows all.
+each, and as many frames. It is measured with our settings (copies, steps, epochs, minibatch,
+rates, scaled rewards), where both do the same amount of work, and with its own defaults, which
+take five times as many gradient steps. The arms take turns, so that a busy machine slows all.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import functools
+import io
 import json
 import statistics
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import gymnasium
 import stable_baselines3
 from stable_baselines3.common.evaluation import evaluate_policy as evaluate_theirs
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from tqdm import tqdm
 
 from experiments.files import replace_text
+from ipo.domains import Make
 from ipo.own_domains import default_settings, evaluate_policy, train_policy
 from ipo.threads import one_thread
 
@@ -36,15 +39,15 @@ FRAMES = SETTINGS.num_envs * SETTINGS.num_steps  # of an update
 Result = tuple[float, float]  # frames per CPU second, return
 
 
-def ours(make: Callable[[], gymnasium.Env], seeds: list[int], num_updates: int) -> Result:
+def ours(make: Make, seed: int, num_updates: int) -> Result:
     before = time.process_time()
-    policy = train_policy({"one": make}, "ppo", seeds, num_updates=num_updates)
+    policy = train_policy({"one": make}, "ppo", [seed], num_updates=num_updates)
     elapsed = time.process_time() - before
     rows = evaluate_policy(policy, {"one": make}, NUM_EPISODES)
-    return len(seeds) * num_updates * FRAMES / elapsed, rows["value"].mean()
+    return num_updates * FRAMES / elapsed, float(rows["value"].mean())
 
 
-def same_settings(make: Callable[[], gymnasium.Env], seed: int, num_updates: int) -> Result:
+def same_settings(make: Make, seed: int, num_updates: int) -> Result:
     s = SETTINGS
     copies = DummyVecEnv([make] * s.num_envs)
     copies = VecNormalize(copies, norm_obs=False, clip_reward=s.reward_clip, gamma=s.discount)
@@ -67,19 +70,41 @@ def same_settings(make: Callable[[], gymnasium.Env], seed: int, num_updates: int
     return learned(model, make, num_updates)
 
 
-def own_defaults(make: Callable[[], gymnasium.Env], seed: int, num_updates: int) -> Result:
+def own_defaults(make: Make, seed: int, num_updates: int) -> Result:
     return learned(stable_baselines3.PPO("MlpPolicy", make(), seed=seed), make, num_updates)
 
 
-def learned(
-    model: stable_baselines3.PPO, make: Callable[[], gymnasium.Env], num_updates: int
-) -> Result:
+def learned(model: stable_baselines3.PPO, make: Make, num_updates: int) -> Result:
     before = time.process_time()
     model.learn(num_updates * FRAMES)
     elapsed = time.process_time() - before
-    env = stable_baselines3.common.monitor.Monitor(make())
-    value, _ = evaluate_theirs(model, env, NUM_EPISODES, deterministic=False)
-    return model.num_timesteps / elapsed, value
+    value, _ = evaluate_theirs(model, Monitor(make()), NUM_EPISODES, deterministic=False)
+    return model.num_timesteps / elapsed, float(value)
+
+
+ARMS = {
+    "ipo, ppo": ours,
+    "stable-baselines3, our settings": same_settings,
+    "stable-baselines3, its defaults": own_defaults,
+}
+
+
+def compare(num_updates: int, seeds: list[int]) -> list[dict[str, float | str]]:
+    """Means over seeds, by environment and arm."""
+    rows = []
+    for name in tqdm(ENVIRONMENTS, desc="comparing", unit="environment"):
+        make = functools.partial(gymnasium.make, name, disable_env_checker=True)
+        with one_thread(), contextlib.redirect_stderr(io.StringIO()):  # bars of single trainings
+            for train in ARMS.values():  # what a first training imports is not measured
+                train(make, 0, 1)
+            results = [
+                [train(make, seed, num_updates) for train in ARMS.values()] for seed in seeds
+            ]
+        for arm, of_arm in zip(ARMS, zip(*results, strict=True), strict=True):
+            speed, value = map(statistics.mean, zip(*of_arm, strict=True))
+            row = {"environment": name, "arm": arm}
+            rows.append(row | {"frames_per_cpu_second": speed, "return": value})
+    return rows
 
 
 def main() -> None:
@@ -91,39 +116,14 @@ def main() -> None:
     num_updates, seeds = options.frames // FRAMES, list(range(options.seeds))
     if not num_updates or not seeds:
         parser.error(f"must be: --frames >= {FRAMES}, --seeds >= 1")
-    arms = {
-        "ipo": lambda make, seed: ours(make, [seed], num_updates),
-        "sb3, same settings": lambda make, seed: same_settings(make, seed, num_updates),
-        "sb3, its defaults": lambda make, seed: own_defaults(make, seed, num_updates),
-    }
-    columns = {name: {arm: [] for arm in arms} for name in ENVIRONMENTS}
-    with one_thread():
-        for arm in arms.values():  # what a first training imports is not measured
-            arm(lambda: gymnasium.make("CartPole-v1"), 0)
-        trainings = [(name, seed) for name in ENVIRONMENTS for seed in seeds]
-        for name, seed in tqdm(trainings, desc="comparing", unit="seed"):
-            make = functools.partial(gymnasium.make, name, disable_env_checker=True)
-            for arm, train in arms.items():
-                columns[name][arm].append(train(make, seed))
-    rows = {
-        name: {
-            arm: dict(
-                zip(
-                    ("frames_per_cpu_second", "return"),
-                    map(statistics.mean, zip(*of_arm, strict=True)),
-                    strict=True,
-                )
-            )
-            for arm, of_arm in own.items()
-        }
-        for name, own in columns.items()
-    }
-    print(f"{options.frames} frames, means of {options.seeds} seeds: frames per CPU second, return")
-    for name, own in rows.items():
-        for arm, row in own.items():
-            print(f"  {name:16}{arm:24}" + "".join(f"{value:10.0f}" for value in row.values()))
+    rows = compare(num_updates, seeds)
+    print(f"{num_updates * FRAMES:,} frames, {len(seeds)} seeds: frames per CPU second, return")
+    for row in rows:
+        print(
+            "  {environment:16}{arm:46}{frames_per_cpu_second:10,.0f}{return:10,.0f}".format(**row)
+        )
     if options.json:
-        numbers = {"frames": num_updates * FRAMES, "seeds": len(seeds), "rows": rows}
+        numbers = {"frames": num_updates * FRAMES, "num_seeds": len(seeds), "rows": rows}
         replace_text(options.json, json.dumps(numbers, indent=1) + "\n")
 
 
