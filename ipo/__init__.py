@@ -13,7 +13,7 @@ An evening's reading, in this order:
     own_domains     the same for environments of your own, with
       domains         what they must have in common, and copies of them
       policy          what comes out, and its files
-      images          the network for images
+      own_networks    for vectors and for images
       threads         one thread for all of it
     stats           intervals and comparisons over runs
     checks          errors that name the parameter, its value and the rule
@@ -37,12 +37,12 @@ __all__ = [
     "distributions",
     "domains",
     "game",
-    "images",
     "lqr",
     "lqr_learners",
     "networks",
     "optimizers",
     "own_domains",
+    "own_networks",
     "policy",
     "ppo",
     "rollouts",

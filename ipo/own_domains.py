@@ -53,6 +53,7 @@ def default_settings(method: str, num_domains: int, **changes: Any) -> PPOSettin
     square = num_domains**2
     sensible: dict[str, Any] = {
         "learning_rate": PPO_RATE if method == "ppo" else IPO_RATE,
+        "adam_epsilon": 1e-5,
         "num_envs": square * math.ceil(30 / square),
         "num_epochs": 8,
         "normalize_rewards": True,

@@ -15,8 +15,8 @@ from gymnasium.spaces import Box, Discrete, Space, flatdim
 from ipo.checks import check_count
 from ipo.distributions import Categorical, Distribution, Gaussian
 from ipo.domains import clipped, dtype_of, is_image
-from ipo.images import ImageNetwork
-from ipo.networks import DenseNetwork, Network, Weights
+from ipo.networks import Network, Weights
+from ipo.own_networks import ImageNetwork, VectorNetwork
 
 __all__ = ["Policy", "check_network", "network_for"]
 
@@ -109,13 +109,13 @@ class Policy:
         return cls(str(arrays["label"]), tuple(arrays["seeds"].tolist()), *spaces, network, players)
 
 
-def network_for(observations: Space, actions: Space) -> DenseNetwork:
+def network_for(observations: Space, actions: Space) -> VectorNetwork:
     """An actor-critic whose kind and sizes fit the spaces."""
     distribution: type[Distribution] = Gaussian if isinstance(actions, Box) else Categorical
     num_actions = int(actions.n) if isinstance(actions, Discrete) else flatdim(actions)
     if is_image(observations):
         return ImageNetwork(observations.shape or (), num_actions, distribution)
-    return DenseNetwork(flatdim(observations), num_actions, distribution)
+    return VectorNetwork(flatdim(observations), num_actions, distribution)
 
 
 def check_network(network: Network, observations: Space, actions: Space) -> None:

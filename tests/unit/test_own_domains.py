@@ -12,7 +12,6 @@ from threadpoolctl import threadpool_info
 
 from ipo.distributions import Categorical, Gaussian
 from ipo.domains import Copies
-from ipo.images import ImageNetwork
 from ipo.networks import DenseNetwork
 from ipo.own_domains import (
     Policy,
@@ -22,6 +21,7 @@ from ipo.own_domains import (
     evaluate_policy,
     train_policy,
 )
+from ipo.own_networks import ImageNetwork, VectorNetwork
 from ipo.threads import one_thread
 
 TINY = {"num_updates": 1, "num_steps": 16, "num_epochs": 1, "minibatch_size": 16}
@@ -185,6 +185,12 @@ def test_images_of_each_run_are_seen_with_its_own_weights_and_in_either_order():
     corner = padded[:, :3, :3].flatten() @ weights["conv1.weight"][0, :, 0]
     kernel = weights["conv1.weight"][0].T.reshape(-1, 3, 3, 3)
     assert torch.isclose((padded[:, :3, :3] * kernel[0]).sum(), corner)
+
+
+def test_a_policy_starts_without_preferences():
+    weights = VectorNetwork(3, 4, Categorical).start([np.random.default_rng(0)])
+    logits, values = VectorNetwork(3, 4, Categorical)(weights, torch.randn(1, 50, 3))
+    assert (logits.softmax(-1) - 0.25).abs().max() < 0.01 < values.std()
 
 
 class Counting(gymnasium.Env):

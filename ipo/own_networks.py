@@ -1,9 +1,11 @@
-"""The actor-critic for observations that are images."""
+"""Actor-critics for domains of your own: observations are vectors or images."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import conv2d
@@ -11,18 +13,32 @@ from torch.nn.functional import conv2d
 from ipo.distributions import Distribution, Gaussian
 from ipo.networks import DenseNetwork, Network, Outputs, Weights
 
-__all__ = ["ImageNetwork"]
+__all__ = ["ImageNetwork", "VectorNetwork"]
 
 SMALL = 4  # pixels of the shorter side, at which convolutions stop
 CHANNELS = (32, 64)  # of the first convolution, and of all others
 
 
-class ImageNetwork(DenseNetwork):
+class VectorNetwork(DenseNetwork):
+    """A :class:`ipo.networks.DenseNetwork` that starts without preferences among actions.
+
+    The actor's last layer starts at a hundredth of an orthogonal matrix, the critic's at one, as
+    Andrychowicz et al. (2021) advise.
+    """
+
+    def _draw(self, generator: np.random.Generator) -> dict[str, np.ndarray]:
+        weights = super()._draw(generator)
+        weights[f"{self.layers['actor'][-1]}.weight"] *= 0.01
+        weights[f"{self.layers['critic'][-1]}.weight"] /= math.sqrt(2)
+        return weights
+
+
+class ImageNetwork(VectorNetwork):
     """Convolutions that actor and critic share, and a hidden layer of tanh units for each.
 
     A convolution is 3x3 with stride 2 and a ReLU; there are as many as it takes until the shorter
     side has at most 4 pixels, so images can have any size. Their weights start like those of the
-    hidden layers (:class:`ipo.networks.DenseNetwork`). Channels come last, or first where that
+    hidden layers of a :class:`ipo.networks.DenseNetwork`. Channels come last, or first where that
     axis is the shortest, as in a stack of frames. Bytes are divided by 255; other numbers are
     taken as they are.
 
