@@ -10,6 +10,7 @@ from pathlib import Path
 
 import nbformat
 
+import benchmarks
 import claims
 import costs
 import licences
@@ -51,6 +52,7 @@ def stage(root: Path, source: Path, notebooks: list[Notebook], profile: str) -> 
         nbformat.write(notebook.read_executed(), source / f"{notebook.name}.ipynb")
     claims.write_fragments(source)
     provenance.write_fragment(source)
+    benchmarks.write_fragment(source)
     costs.write_fragment(source)
     licences.write_fragment(source)
     run_times = source / "_generated" / "run_times.md"

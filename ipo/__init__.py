@@ -10,7 +10,11 @@ An evening's reading, in this order:
     networks        policies and critics, and the average of several players' outputs
     rollouts        experience in many environments at once, and advantages
     ppo             PPO, IPO and the ensemble: that game between networks
-    own_domains     the same for environments of your own
+    own_domains     the same for environments of your own, with
+      domains         what they must have in common, and copies of them
+      policy          what comes out, and its files
+      own_networks    for vectors and for images
+      threads         one thread for all of it
     stats           intervals and comparisons over runs
     checks          errors that name the parameter, its value and the rule
 
@@ -31,17 +35,21 @@ __all__ = [
     "causality",
     "checks",
     "distributions",
+    "domains",
     "game",
     "lqr",
     "lqr_learners",
     "networks",
     "optimizers",
     "own_domains",
+    "own_networks",
+    "policy",
     "ppo",
     "rollouts",
     "stats",
+    "threads",
     "worlds",
 ]
 
-register("ipo/ColoredKeys-v0", entry_point="ipo.worlds.colored_keys:ColoredKeysEnv")
-register("ipo/Door-v0", entry_point="ipo.worlds.door:DoorEnv")
+register("ipo/ColoredKeys-v0", entry_point="ipo.worlds:ColoredKeysEnv")
+register("ipo/Door-v0", entry_point="ipo.worlds:DoorEnv")

@@ -10,7 +10,7 @@ from typing import Annotated, Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import torch
-from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector import VectorEnv
 from torch import Tensor
 
 from ipo.checks import Count, Positive, Probability, checked, one_of
@@ -57,8 +57,8 @@ class FromGymnasium:
     """
 
     def __init__(self, envs: VectorEnv, num_runs: int, seed: int) -> None:
-        mode = envs.metadata["autoreset_mode"]
-        if mode != AutoresetMode.SAME_STEP:
+        mode = envs.metadata.get("autoreset_mode")
+        if getattr(mode, "name", None) != "SAME_STEP":  # gymnasium before 1.1 has no modes
             raise ValueError(f"envs: have autoreset_mode = {mode}, must have SAME_STEP")
         if envs.num_envs % num_runs:
             raise ValueError(f"envs: {envs.num_envs} copies, must be a multiple of {num_runs} runs")

@@ -2,5 +2,23 @@
 
 ``colored_keys`` (MiniGrid), and ``tabular``, which turns them into tables; ``door`` (MuJoCo),
 ``many_doors`` side by side, and about them ``hooking``, a controller by hand, and ``pulling``, the
-rule that tells how a door was pulled.
+rule that tells how a door was pulled. Each brings its packages as an extra: ``ipo[keys,door]``.
 """
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
+# What is registered with gymnasium: module, and the extra with the packages that it needs.
+ENVIRONMENTS = {"ColoredKeysEnv": ("colored_keys", "keys"), "DoorEnv": ("door", "door")}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in ENVIRONMENTS:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    module, extra = ENVIRONMENTS[name]
+    try:
+        return getattr(import_module(f"{__name__}.{module}"), name)
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(f"{error}: {name} needs pip install 'ipo[{extra}]'") from error

@@ -13,6 +13,11 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
+if not (ROOT / "data").is_dir():
+    raise FileNotFoundError(
+        f"{ROOT / 'data'}: there are no shipped rows; the experiments must be installed where they "
+        "lie: pip install --no-deps --editable notebooks, in the folder of the book"
+    )
 # Packages whose code decides numbers in the rows.
 PACKAGES = (
     *("numpy", "scipy", "torch", "pandas"),

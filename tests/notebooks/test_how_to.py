@@ -24,7 +24,12 @@ def test_how_to_runs_with_the_installed_package_alone(tmp_path):
     first, *others = sources  # the parameters, then what they are replaced by
     script = elsewhere / "how_to.py"
     alone = "import sys\nsys.modules['experiments'] = None  # the book's package is not there"
-    script.write_text("\n\n".join([alone, "In = []", first, parameters, *others]))
+    light = (
+        "import ipo.own_domains\n"
+        "heavy = {'pandas', 'scipy', 'mujoco', 'minigrid', 'matplotlib'} & sys.modules.keys()\n"
+        "assert not heavy, f'importing the package imports {heavy}'"
+    )
+    script.write_text("\n\n".join([alone, light, "In = []", first, parameters, *others]))
     where = "\nimport ipo\nprint('installed in', ipo.__file__)\n"
     script.write_text(script.read_text() + where)
     done = subprocess.run(

@@ -1,0 +1,27 @@
+"""The table of speed and returns in your own domains, from what `tests/bench` has recorded."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from experiments.registry import DATA
+
+RECORD = DATA / "bench" / "own_domains.json"
+
+
+def write_fragment(folder: Path) -> None:
+    """Writes ``_generated/own_domains.md`` under ``folder``."""
+    target = Path(folder) / "_generated"
+    target.mkdir(parents=True, exist_ok=True)
+    (target / "own_domains.md").write_text(table(), encoding="utf-8")
+
+
+def table() -> str:
+    record = json.loads(RECORD.read_text())
+    lines = ["| Environment | | Frames per CPU second | Return |", "|:--|:--|--:|--:|"]
+    for row in record["rows"]:
+        speed, value = f"{row['frames_per_cpu_second']:,.0f}", f"{row['return']:,.0f}"
+        lines.append(f"| {row['environment']} | {row['arm']} | {speed} | {value} |")
+    title = f"After {record['frames']:,} frames; means of {record['num_seeds']} seeds:"
+    return "\n".join([title, "", *lines, ""])
