@@ -29,7 +29,7 @@ from ipo.checks import (
 )
 from ipo.distributions import Distribution, Generators
 from ipo.game import domains_of_players, play_round
-from ipo.networks import Network, OnTable, Weights
+from ipo.networks import Network, OnTable, Weights, chosen_rows
 from ipo.rollouts import Collector, Environments, Rollout, TimeOuts
 
 METHODS = ("ppo", "ipo", "ensemble")
@@ -236,15 +236,14 @@ class Training:
         others = self._others(d, frames.observations)
         if settings.normalize_advantages == "rollout":
             frames = frames._replace(advantages=standardize(frames.advantages))
-        runs = torch.arange(len(frames.actions), device=frames.actions.device).unsqueeze(1)
         for epoch in range(settings.num_epochs):
             skip = settings.skip_last_frames and epoch % 2 == 1
             for chosen in minibatches(frames, settings, self.orders, skip):
-                batch = Rollout(*(x[runs, chosen] for x in frames))
+                batch = Rollout(*(chosen_rows(x, chosen) for x in frames))
                 parameters, values = self.network(player, batch.observations)
                 if others:
-                    parameters = others[0][runs, chosen] + share * parameters
-                    values = others[1][runs, chosen] + share * values
+                    parameters = chosen_rows(others[0], chosen) + share * parameters
+                    values = chosen_rows(others[1], chosen) + share * values
                 loss = clipped_loss(self.network.distribution, parameters, values, batch, settings)
                 self._descend(d, loss)
 
@@ -261,7 +260,8 @@ class Training:
         gradients = torch.autograd.grad(loss.sum(), leaves)
         clipped = clip_gradients(gradients, self.settings.max_gradient_norm)
         for leaf, gradient in zip(leaves, clipped, strict=True):
-            leaf.grad = gradient
+            # The fused Adam pairs weights and gradients by their place in memory.
+            leaf.grad = gradient.contiguous()
         self.optimizers[d].step()
 
     @torch.no_grad()

@@ -179,7 +179,7 @@ def indices_of(num_runs: int, num_frames: int, num_rows: int, seed: int) -> Tens
     num_rows=st.integers(1, 20),
 )
 def test_table_gives_what_its_images_give(seed, num_runs, num_frames, num_rows):
-    network, table = DoubleNetwork(), random_images(num_rows, seed=seed)
+    network, table = DoubleNetwork(), random_images(num_rows, seed=seed).double()
     weights = network.start(generators(*range(num_runs)))
     indices = indices_of(num_runs, num_frames, num_rows, seed)
     on_table = OnTable(network, table)
@@ -194,7 +194,7 @@ def test_table_gives_what_its_images_give(seed, num_runs, num_frames, num_rows):
 
 
 def test_gradient_through_a_table_counts_every_occurrence():
-    network, table = DoubleNetwork(), random_images(5)
+    network, table = DoubleNetwork(), random_images(5).double()
     indices = torch.tensor([[0, 0, 3, 0], [1, 2, 3, 4]])  # runs differ in how many are distinct
     gradients = []
     for evaluate in (OnTable(network, table), lambda w, i: network(w, table[i])):
@@ -208,7 +208,7 @@ def test_gradient_through_a_table_counts_every_occurrence():
 
 @pytest.mark.parametrize("num_rows", [1, 256, 257, 600])
 def test_average_of_a_whole_table(num_rows):
-    network, table = DoubleNetwork(), random_images(num_rows)
+    network, table = DoubleNetwork(), random_images(num_rows).double()
     players = [network.start(generators(0, 1)), network.start(generators(2, 3))]
     logits, values = OnTable(network, table).average(players)
     assert logits.shape == (2, num_rows, 7) and values.shape == (2, num_rows)

@@ -280,7 +280,8 @@ class Nowhere:
 
 def in_training(settings: PPOSettings, num_players: int = 1) -> Training:
     """Two runs of players who learn from a table with five rows, with frames by hand."""
-    network = OnTable(DoubleNetwork(), torch.arange(5 * 147).reshape(5, 7, 7, 3) % 11)
+    table = torch.arange(5 * 147.0, dtype=torch.float64).reshape(5, 7, 7, 3) % 11
+    network = OnTable(DoubleNetwork(), table)
     return Training(network, lambda *_: Nowhere(), num_players, settings, [0, 1])
 
 
