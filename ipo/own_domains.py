@@ -26,6 +26,7 @@ from ipo.domains import Copies, Domains, check_domains
 from ipo.networks import Network, copied
 from ipo.policy import Policy, check_network, network_for
 from ipo.ppo import METHODS, PPOSettings, Training
+from ipo.rollouts import Device
 from ipo.threads import one_thread
 
 if TYPE_CHECKING:
@@ -70,7 +71,7 @@ def train_policy(
     settings: PPOSettings | None = None,
     network: Network | None = None,
     label: str | None = None,
-    device: str = "cpu",
+    device: Device = "cpu",
     **changes: Any,
 ) -> Policy:
     """Train one policy for each seed by ``ppo``, ``ipo`` or ``ensemble``.

@@ -30,7 +30,7 @@ from ipo.checks import (
 from ipo.distributions import Distribution, Generators
 from ipo.game import domains_of_players, play_round
 from ipo.networks import Network, OnTable, Weights, chosen_rows
-from ipo.rollouts import Collector, Environments, Rollout, TimeOuts
+from ipo.rollouts import Collector, Device, Environments, Rollout, TimeOuts
 
 METHODS = ("ppo", "ipo", "ensemble")
 NORMALIZATIONS = ("none", "minibatch", "rollout")
@@ -132,19 +132,11 @@ class PPOSettings:
         return size
 
     @checked
-    def collector(self, environments: Environments, device: str = "cpu") -> Collector:
+    def collector(self, environments: Environments, device: Device = "cpu") -> Collector:
         """Of a player in its environments."""
         clip = self.reward_clip if self.normalize_rewards else None
         sizes = self.num_steps, self.discount, self.gae_lambda
         return Collector(environments, *sizes, self.time_outs, clip, device)
-
-
-def check_device(name: str, device: str) -> None:
-    """Torch has several errors for a device that it cannot use."""
-    try:
-        torch.empty(0, device=device)
-    except (RuntimeError, AssertionError, ImportError) as error:
-        raise ValueError(f"{name} = {device!r}: must be one that torch can use: {error}") from error
 
 
 class Training:
@@ -177,7 +169,7 @@ class Training:
         num_domains: Count,
         settings: PPOSettings,
         seeds: Seeds,
-        device: Annotated[str, check_device] = "cpu",
+        device: Device = "cpu",
     ) -> None:
         owned = settings.domains_of_players(num_domains)
         copies = settings.copies_of_players(num_domains)

@@ -151,6 +151,17 @@ class Rollout(NamedTuple):
         return Rollout(*(x.flatten(1, 2) for x in self))
 
 
+def check_device(name: str, device: str | torch.device) -> None:
+    """Torch has several errors for a device that it cannot use."""
+    try:
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError, ImportError) as error:
+        raise ValueError(f"{name} = {device!r}: must be one that torch can use: {error}") from error
+
+
+Device = Annotated[str | torch.device, check_device]
+
+
 @checked
 @dataclass
 class Collector:
@@ -172,7 +183,7 @@ class Collector:
     gae_lambda: Probability
     time_outs: TimeOuts = "bootstrap"
     reward_clip: Positive | None = None
-    device: str = "cpu"
+    device: Device = "cpu"
 
     def __post_init__(self) -> None:
         self.observation = self.environments.reset().to(self.device)
