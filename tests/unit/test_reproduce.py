@@ -135,9 +135,9 @@ def test_runs_of_a_chaotic_cell_are_alike_or_not(shift, expected):
     assert not reproduce.alike(runs(range(10)), runs(range(10)).assign(domain="another"))
 
 
-@pytest.mark.parametrize("name", [*confirm.CHAOTIC, "door/success", "door/strategies"])
-def test_shipped_cells_have_runs_enough_to_be_told_apart(name):
-    chapter, name = name.split("/")
+@pytest.mark.parametrize("experiment", [*confirm.CHAOTIC, "door/success", "door/strategies"])
+def test_shipped_cells_have_runs_enough_to_be_told_apart(experiment):
+    chapter, name = experiment.split("/")
     shipped = Store(registry.DATA / "results" / chapter, name)
     columns = min(shipped.batches(), key=lambda batch: len(batch["seeds"]))["columns"]
     rows = select(shipped.rows(), columns)
