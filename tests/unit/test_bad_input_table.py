@@ -102,7 +102,7 @@ def array(without: str = "") -> Callable[[Any], list[Bad]]:
 
 # What a name means, means the same everywhere; rows say where one does not.
 BY_NAME = {
-    r"(num|dim|max)_\w+s|dim_\w+|\w*size|width|height|updates|\w+_once|\w+_every": COUNT,
+    r"(num|dim)_\w+|max_\w+s|\w*size|width|height|updates|\w+_once|\w+_every": COUNT,
     r"learning_rate|bound|max_gradient_norm|contraction|clip|\w+_clip|\w+_epsilon": POSITIVE,
     r"weight_decay|\w+_scale|\w+_weight|penalty|ridge|std": NON_NEGATIVE,
     r"discount|gae_lambda|part": PROBABILITY,
