@@ -30,6 +30,7 @@ ORDERS = ("in_turn", "together")
 Order = Annotated[str, one_of(ORDERS)]
 
 Cost = Callable[[Tensor], Tensor]  # policy [R, ...] -> [R]
+BestCosts = Annotated[Tensor, "R E"] | Annotated[Tensor, "R 1"]
 
 
 @checked
@@ -161,14 +162,14 @@ class LinearPlayers:
 
 
 @checked
-def nash_gap(costs: Annotated[Tensor, "R E"], best_costs: Annotated[Tensor, "R E"]) -> Tensor:
+def nash_gap(costs: Annotated[Tensor, "R E"], best_costs: BestCosts) -> Tensor:
     """How much the player who could gain most would gain by moving alone.
 
         gap = max_d [ J_d(pi_av) - min over pi_d of J_d(pi_av) ]
 
     Args:
         costs: ``[R, E]``, every player's cost at the current average.
-        best_costs: the same at that player's best response to the others.
+        best_costs: the same at that player's best response to the others; or ``[R, 1]``.
 
     Returns:
         ``[R]``; zero exactly at a Nash equilibrium.

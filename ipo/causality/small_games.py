@@ -137,7 +137,9 @@ def downhill(costs: Costs, policy: Annotated[Tensor, "R P"]) -> Tensor:
 
 
 @checked
-def residual(costs: Costs, players: Players, bound: Positive | None = None) -> Tensor:
+def residual(
+    costs: Costs, players: Annotated[Tensor, "R players P"], bound: Positive | None = None
+) -> Tensor:
     """How far from an equilibrium, ``[R]``: the largest step that a player would still make.
 
         max over d, i of abs(clip(w_d - grad_d J_d, -bound, bound) - w_d),    grad_d = grad / E

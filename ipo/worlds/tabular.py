@@ -173,10 +173,10 @@ class TabularDomains:
     def __call__(
         self,
         domains: Annotated[Sequence[Natural], "d"],
-        num_copies: Annotated[Sequence[Count], "d"],
+        num_copies: Count | Annotated[Sequence[Count], "d"],
         generators: Annotated[Generators, "R"],
     ) -> TabularEnvironments:
-        """``num_copies`` of each of ``domains``, for one run per generator."""
+        """``num_copies`` of each of ``domains``, or a list of them; one run per generator."""
         check_count("domains", max(domains), 0, len(self.observation_of) - 1)
         return TabularEnvironments(self, np.repeat(domains, num_copies), generators)
 

@@ -102,7 +102,7 @@ def array(without: str = "") -> Callable[[Any], list[Bad]]:
 
 # What a name means, means the same everywhere; rows say where one does not.
 BY_NAME = {
-    r"(num|dim|max)_\w+s|dim_\w+|\w*size|width|height|updates|\w+_once|\w+_every": COUNT,
+    r"(num|dim)_\w+|max_\w+s|\w*size|width|height|updates|\w+_once|\w+_every": COUNT,
     r"learning_rate|bound|max_gradient_norm|contraction|clip|\w+_clip|\w+_epsilon": POSITIVE,
     r"weight_decay|\w+_scale|\w+_weight|penalty|ridge|std": NON_NEGATIVE,
     r"discount|gae_lambda|part": PROBABILITY,
@@ -467,7 +467,7 @@ def rows_of_causality() -> Iterator[Row]:
     yield row(small_games.downhill, at, costs=of_domains, policy=flat)
     at = {"costs": costs, "players": players}
     fits = lambda good: stacked(good) + bad("shape", good[:, :1])  # noqa: E731
-    yield row(small_games.residual, at, costs=of_domains, players=fits)
+    yield row(small_games.residual, at, costs=of_domains, players=stacked)
     alone = at | {"alone": small_games.GameSettings("pooled", num_rounds=1)}
     yield row(small_games.gap, alone, costs=of_domains, players=fits)
     vote = {"optima": players, "bound": 1.0}
@@ -546,7 +546,7 @@ def rows_of_worlds() -> Iterator[Row]:
         tabular.TabularDomains([task]).__call__,
         {"domains": [0], "num_copies": [2], "generators": [rng]},
         domains=LIST + bad("range", [1], [-1]) + bad("shape", [0, 0]),
-        num_copies=LIST + bad("range", [0]) + bad("shape", [1, 1]),
+        num_copies=COUNT[1:3] + bad("range", 0, [0]) + bad("shape", [1, 1]),
         generators=LIST + bad("kind of object", [3]),
     )
     policy = np.full((3, 2, 2), 0.5)
