@@ -10,16 +10,12 @@ An evening's reading, in this order:
     networks        policies and critics, and the average of several players' outputs
     rollouts        experience in many environments at once, and advantages
     ppo             PPO, IPO and the ensemble: that game between networks
-    own_domains     the same for environments of your own, with
-      domains         what they must have in common, and copies of them
-      policy          what comes out, and its files
-      own_networks    for vectors and for images
-      threads         one thread for all of it
     stats           intervals and comparisons over runs
     checks          errors that name the parameter, its value and the rule
 
-Then, as a chapter needs them:
+Then, as you need them:
 
+    own_domains     the same for environments of your own
     causality       causal models, invariant predictors, IRM-Games, ICP, games of two numbers
     worlds          coloured keys and doors
 
@@ -35,19 +31,15 @@ __all__ = [
     "causality",
     "checks",
     "distributions",
-    "domains",
     "game",
     "lqr",
     "lqr_learners",
     "networks",
     "optimizers",
     "own_domains",
-    "own_networks",
-    "policy",
     "ppo",
     "rollouts",
     "stats",
-    "threads",
     "worlds",
 ]
 

@@ -26,9 +26,9 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from tqdm import tqdm
 
 from experiments.files import replace_text
-from ipo.domains import Make
 from ipo.own_domains import default_settings, evaluate_policy, train_policy
-from ipo.threads import one_thread
+from ipo.own_domains.copies import Make
+from ipo.own_domains.threads import one_thread
 
 ENVIRONMENTS = ("CartPole-v1", "Acrobot-v1", "Pendulum-v1")
 NUM_EPISODES = 20

@@ -11,7 +11,6 @@ from gymnasium import spaces
 from threadpoolctl import threadpool_info
 
 from ipo.distributions import Categorical, Gaussian
-from ipo.domains import Copies
 from ipo.networks import DenseNetwork
 from ipo.own_domains import (
     Policy,
@@ -21,8 +20,9 @@ from ipo.own_domains import (
     evaluate_policy,
     train_policy,
 )
-from ipo.own_networks import ImageNetwork, VectorNetwork
-from ipo.threads import one_thread
+from ipo.own_domains.copies import Copies
+from ipo.own_domains.networks import ImageNetwork, VectorNetwork
+from ipo.own_domains.threads import one_thread
 
 TINY = {"num_updates": 1, "num_steps": 16, "num_epochs": 1, "minibatch_size": 16}
 

@@ -14,13 +14,13 @@ from gymnasium.spaces import Box, Discrete, Space, flatdim
 
 from ipo.checks import check_count
 from ipo.distributions import Categorical, Distribution, Gaussian
-from ipo.domains import clipped, dtype_of, is_image
 from ipo.networks import Network, Weights
-from ipo.own_networks import ImageNetwork, VectorNetwork
+from ipo.own_domains.copies import clipped, dtype_of, is_image
+from ipo.own_domains.networks import ImageNetwork, VectorNetwork
 
 __all__ = ["Policy", "check_network", "network_for"]
 
-FORMAT = "ipo.policy.Policy, 1"
+FORMAT = "ipo policy, 1"
 
 
 @dataclass(frozen=True)

@@ -22,12 +22,12 @@ from tqdm.auto import tqdm
 
 from ipo.checks import check_choice, check_count, check_counts
 from ipo.distributions import Generators
-from ipo.domains import Copies, Domains, check_domains
 from ipo.networks import Network, copied
-from ipo.policy import Policy, check_network, network_for
+from ipo.own_domains.copies import Copies, Domains, check_domains
+from ipo.own_domains.policy import Policy, check_network, network_for
+from ipo.own_domains.threads import one_thread
 from ipo.ppo import METHODS, PPOSettings, Training
 from ipo.rollouts import Device
-from ipo.threads import one_thread
 
 if TYPE_CHECKING:
     import pandas as pd
