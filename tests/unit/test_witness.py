@@ -1,5 +1,7 @@
 """What verify and confirm say: on a toy with slices of its own, and of the shipped record."""
 
+import runpy
+import shutil
 from dataclasses import replace
 
 import pandas as pd
@@ -7,7 +9,7 @@ import pytest
 import toy_experiment
 from toy_experiment import CELLS, Cell
 
-from experiments import confirm, registry, witness
+from experiments import confirm, origin, registry, witness
 from experiments.experiment import Experiment
 from experiments.store import Store
 
@@ -124,3 +126,11 @@ def test_every_cell_that_has_a_slice_has_it_recorded():
         recorded = [b["columns"] for b in Store(witness.WITNESS / chapter, name).batches()]
         wanted = [cell.columns for cell in witness.short_cells(chapter, name)]
         assert sorted(map(str, wanted)) == sorted(map(str, recorded)), f"{chapter}/{name}"
+
+
+def test_experiments_that_were_copied_to_where_no_rows_are_say_how_to_install_them(tmp_path):
+    copied = tmp_path / "lib" / "experiments" / "origin.py"
+    copied.parent.mkdir(parents=True)
+    shutil.copy(origin.__file__, copied)
+    with pytest.raises(FileNotFoundError, match=r"no shipped rows.* --editable notebooks"):
+        runpy.run_path(str(copied))
