@@ -16,6 +16,7 @@ An evening's reading, in this order:
 Then, as you need them:
 
     own_domains     the same for environments of your own
+    notebooks       misspelt parameters of a notebook
     causality       causal models, invariant predictors, IRM-Games, ICP, games of two numbers
     worlds          coloured keys and doors
 
@@ -35,6 +36,7 @@ __all__ = [
     "lqr",
     "lqr_learners",
     "networks",
+    "notebooks",
     "optimizers",
     "own_domains",
     "ppo",

@@ -174,8 +174,11 @@ NUMBERS: dict[Any, Callable[..., None]] = {
 
 
 @functools.cache
-def _rules(declared: Any) -> dict[str, Any]:
-    return typing.get_type_hints(declared, include_extras=True)
+def _rules(function: Callable[..., Any]) -> dict[str, Any]:
+    """Of the parameters; what is returned may have a type that is not imported."""
+    own = {name: rule for name, rule in function.__annotations__.items() if name != "return"}
+    declared = types.SimpleNamespace(__annotations__=own)
+    return typing.get_type_hints(declared, function.__globals__, include_extras=True)
 
 
 def _check_all(given: Iterable[tuple[str, object, Any]]) -> None:

@@ -11,16 +11,15 @@ their spaces of observations and actions. The page "Your own domains" shows how 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import torch
 from torch import Tensor
 from tqdm.auto import tqdm
 
-from ipo.checks import check_choice, check_count, check_counts
+from ipo.checks import Count, Seed, Seeds, checked, one_of
 from ipo.distributions import Generators
 from ipo.networks import Network, copied
 from ipo.own_domains.copies import Copies, Domains, check_domains
@@ -64,10 +63,11 @@ def default_settings(method: str, num_domains: int, **changes: Any) -> PPOSettin
 
 
 @one_thread()
+@checked
 def train_policy(
     domains: Domains,
-    method: str = "ipo",
-    seeds: Sequence[int] = (0,),
+    method: Annotated[str, one_of(METHODS)] = "ipo",
+    seeds: Seeds = (0,),
     settings: PPOSettings | None = None,
     network: Network | None = None,
     label: str | None = None,
@@ -91,12 +91,10 @@ def train_policy(
             differ between domains or are not supported, a network that does not fit them,
             settings that make no sense; observations or rewards that are not finite.
     """
-    check_choice("method", method, METHODS)
     needed = 1 if method == "ppo" else 2
     observations, actions = check_domains("domains", domains, minimum=needed)
     settings = settings or default_settings(method, len(domains))
     settings = replace(settings, method=method, **changes)
-    check_counts("seeds", list(seeds), minimum=0)
     network = network or network_for(observations, actions)
     check_network(network, observations, actions)
     names = list(domains)
@@ -112,12 +110,13 @@ def train_policy(
 
 
 @one_thread()
+@checked
 def evaluate_policy(
     policy: Policy,
     domains: Domains,
-    num_episodes: int = 20,
-    seed: int = 12345,
-    max_steps: int = 10_000,
+    num_episodes: Count = 20,
+    seed: Seed = 12345,
+    max_steps: Count = 10_000,
 ) -> pd.DataFrame:
     """Mean return of whole episodes with sampled actions: tidy rows, one per run and domain.
 
@@ -129,9 +128,6 @@ def evaluate_policy(
     """
     import pandas as pd
 
-    check_count("num_episodes", num_episodes)
-    check_count("seed", seed, minimum=0)
-    check_count("max_steps", max_steps)
     check_domains("domains", domains, trained=(policy.observations, policy.actions))
     rows = []
     total = len(domains) * len(policy.seeds) * num_episodes
@@ -149,13 +145,14 @@ def evaluate_policy(
     return pd.DataFrame(rows, columns=["method", "run", "domain", "metric", "value"])
 
 
+@checked
 def compare(
     train_domains: Domains,
     test_domains: Domains,
-    seeds: Sequence[int] = (0, 1),
+    seeds: Seeds = (0, 1),
     controls: bool = False,
-    num_episodes: int = 20,
-    max_steps: int = 10_000,
+    num_episodes: Count = 20,
+    max_steps: Count = 10_000,
     **changes: Any,
 ) -> pd.DataFrame:
     """PPO and IPO side by side: rows of every method, run and domain.
@@ -167,8 +164,10 @@ def compare(
     import pandas as pd
 
     both = {**train_domains, **test_domains}
-    check_domains("train_domains", train_domains, minimum=2)
-    check_domains("train_domains and test_domains", both)
+    spaces = check_domains("train_domains", train_domains, minimum=2)
+    check_domains("test_domains", test_domains, trained=spaces)
+    if again := sorted(train_domains.keys() & test_domains.keys()):
+        raise ValueError(f"test_domains = {again}: must have names that train_domains has not")
     arms = {"ppo": ("ppo", PPO_RATE), "ipo": ("ipo", IPO_RATE)}
     if controls:
         arms |= {

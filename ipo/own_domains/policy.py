@@ -133,11 +133,11 @@ def check_network(network: Network, observations: Space, actions: Space) -> None
     try:
         parameters, _ = network(network.start(generators), seen)
     except RuntimeError as error:
-        raise ValueError(f"network: {name} does not take observations {observations}") from error
+        raise ValueError(f"network: {name} must take observations {observations}") from error
     action = network.distribution.sample(parameters, generators)[0, 0]
     num_choices = parameters.shape[-1] if isinstance(actions, Discrete) else None
     if action.shape != actions.shape or num_choices != getattr(actions, "n", None):
-        raise ValueError(f"network: {name} does not give actions {actions}")
+        raise ValueError(f"network: {name} must give actions {actions}")
 
 
 def _bounds(name: str, space: Space) -> dict[str, Any]:

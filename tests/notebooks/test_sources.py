@@ -7,7 +7,7 @@ import nbformat
 import pytest
 import yaml
 
-import execute
+import chapters
 
 NOTEBOOKS = Path(__file__).resolve().parents[2] / "notebooks"
 SOURCES = [path for path in sorted(NOTEBOOKS.rglob("*.ipynb")) if "checkpoint" not in path.name]
@@ -106,4 +106,4 @@ def test_all_that_is_read_makes_a_notebook_run_again():
     """Folders of data/ are in the fingerprint of every notebook, but for those made on the way."""
     named = {a or b for code in CODE.values() for a, b in PLACE.findall(code)}
     on_the_way = {"tabulated", "confirmed", "reproduced"}  # a cache; a page's record; outputs
-    assert named - on_the_way == set(execute.DATA)
+    assert named - on_the_way == set(chapters.DATA)

@@ -13,10 +13,10 @@ from small import paper_problem, trained_gain
 
 from experiments.experiment import Experiment
 from experiments.lqr import Cell, run_cell
-from experiments.parameters import check_notebook_parameters
 from experiments.store import Store
 from ipo.lqr import sample_problem
 from ipo.lqr_learners import LQRSettings
+from ipo.notebooks import check_notebook_parameters
 
 NAN, INF = math.nan, math.inf
 

@@ -38,6 +38,8 @@ from ipo import game, lqr, lqr_learners, optimizers, own_domains, ppo, rollouts,
 from ipo.causality import icp, predictors, scalar_control, scm, small_games
 from ipo.distributions import Categorical
 from ipo.networks import DenseNetwork, GridNetwork, OnTable, copied
+from ipo.own_domains import copies, networks
+from ipo.own_domains import policy as policies
 from ipo.worlds import colored_keys, door, hooking, many_doors, pulling, tabular
 
 NAN, INF = math.nan, math.inf
@@ -109,6 +111,7 @@ BY_NAME = {
     r"method|optimizer|order|side|color\w*|camera|choice|time_outs|precision|\w+_a\w+s": CHOICE,
     r"seeds": SEEDS,
     r"\w+_rewards|skip_last_frames|early_stopping": FLAG,
+    r"device": bad("choice", "misspelt") + bad("kind of object", 3),
     r"problem|settings|task|rng|random|generator|params|model|experiment": OBJECT,
     r"env|environments|alone|trained": OBJECT,
 }
@@ -296,45 +299,60 @@ def rows_of_learning() -> Iterator[Row]:
     others = bad("shape", weights[:1], [dense.start(generators)] * 2, [weights[0], {}])
     yield row(begun.set_players, {"players": weights}, players=others)
 
+    yield from rows_of_own_domains(make)
+
+
+def rows_of_own_domains(make: Callable[[], gymnasium.Env]) -> Iterator[Row]:
     domains = {"a": make, "b": make}
-    no_domains = bad("kind of object", 3, [make], {"a": 3, "b": make})
-    seeds = bad("range", [], [-1], [0, 0]) + bad("kind of object", [0.5])
+    no_domains = bad("kind of object", 3, [make], {"a": 3, "b": make}, {"a": lambda: None})
+    two = no_domains + bad("sample size", {"a": make})
+    spaces = dict(zip(("observations", "actions"), copies.check_domains("", domains), strict=True))
+    network = policies.network_for(**spaces)
+    players = [network.start([np.random.default_rng(0)])]
+    policy = own_domains.Policy("ipo", (0,), **spaces, network=network, players=players)
+    wrong = bad("shape", DenseNetwork(3, 2, Categorical), network_for_pictures())
     yield row(
         own_domains.train_policy,
         {"domains": domains, "num_updates": 1},
-        domains=no_domains + bad("sample size", {"a": make}),
+        domains=two,
         method=CHOICE[:1],
-        seeds=seeds,
-        settings="checked in Training",
-        network="checked in Training",
-        label="any text",
-        changes="checked by PPOSettings",
+        settings=OBJECT,
+        network=OBJECT + wrong,
+        label=bad("kind of object", 3),
+        changes=bad("range", {"num_updates": 0}),
     )
-    policy = own_domains.Policy("ipo", network, weights, (0, 1))
     yield row(
         own_domains.evaluate_policy,
         {"policy": policy, "domains": domains},
-        policy="made by train_policy",
+        policy=OBJECT,
         domains=no_domains + bad("sample size", {}),
-        seed="of NumPy's generator",
+        seed=SEED,
     )
     yield row(
         own_domains.compare,
-        {"train_domains": domains, "test_domains": domains},
-        train_domains=bad("sample size", {"a": make}),
-        test_domains="checked as the training domains",
-        seeds=seeds,
-        controls="any truth value",
-        num_episodes="checked by evaluate_policy",
-        changes="checked by PPOSettings",
+        {"train_domains": domains, "test_domains": {"c": make}},
+        train_domains=two,
+        test_domains=no_domains + bad("overlapping names", {"b": make}),
+        controls=FLAG,
+        changes=bad("range", {"num_updates": 0}),
     )
     yield row(
-        own_domains.check_domains,
-        {"name": "domains", "domains": domains},
-        name="of the parameter",
-        domains=no_domains + bad("sample size", {}),
-        minimum="a constant of the callers",
+        policy.act,
+        {"observation": np.zeros(4), "run": 0},
+        observation=bad("shape", np.zeros(3)),
+        run=NATURAL + bad("range", 1),
     )
+    yield row(
+        networks.ImageNetwork,
+        {"shape": (8, 8, 3), "num_actions": 2},
+        shape=bad("shape", (8, 8), (0, 8, 3)),
+        distribution=FUNCTION,
+        hidden=bad("range", (0,)),
+    )
+
+
+def network_for_pictures() -> networks.ImageNetwork:
+    return networks.ImageNetwork((8, 8, 3), 2, Categorical)
 
 
 def rows_of_causality() -> Iterator[Row]:
@@ -602,7 +620,6 @@ def rows_of_experiments() -> Iterator[Row]:
         name=bad("kind of object", 3, None),
         experiments=bad("kind of object", 3, {"a": 3}),
         results_dir=bad("kind of object", 3),
-        policies_dir=bad("kind of object", 3),
     )
     yield row(DoorPicture, {"params": door.DoorParams()})
     yield row(
@@ -639,16 +656,21 @@ LOOP = "called in every step of a training: its arrays come from what was checke
 RECORD = "a record of what was computed; nobody makes one by hand"
 STATE = "what state() gave; check-points have a digest"
 TRUSTING = {
-    r"ipo\.checks\..*": "is a check itself; in test_bad_input.py",
+    r"ipo\.(checks|notebooks)\..*": "is a check itself; in test_bad_input.py",
     r"ipo\.distributions\..*": LOOP,
     r"ipo\.game\.average": LOOP,
     r"ipo\.optimizers\.descend": LOOP,
     r"ipo\.lqr\.feedback_costs": LOOP,
     r"ipo\.lqr\.(LQR\.to|split_domains)": "torch's own conversion and view, by a new name",
     r"ipo\.lqr_learners\.Learner": RECORD,
-    r"ipo\.networks\.(\w+\.__call__|dense|Tanh.*)": LOOP,
-    r"ipo\.own_domains\.(Policy|network_for)": "made by train_policy, of checked spaces",
-    r"ipo\.own_domains\.Policy\.act": LOOP,
+    r"ipo\.networks\.(\w+\.__call__|dense|Tanh.*|\w+\.after_pooling|averaged|chosen_rows)": LOOP,
+    r"ipo\.own_domains\.copies\.check_domains": "is a check itself; train_policy shows it",
+    r"ipo\.own_domains\.copies\.(Copies.*|is_image|dtype_of|clipped)": "of checked domains",
+    r"ipo\.own_domains\.policy\.(Policy|Policy\.save|network_for)": "of checked spaces",
+    r"ipo\.own_domains\.policy\.Policy\.load": "every flip of a bit is, in test_own_domains.py",
+    r"ipo\.own_domains\.policy\.check_network": "is a check itself; train_policy shows it",
+    r"ipo\.own_domains\.networks\.(\w+\.(__call__|frozen)|VectorNetwork)": "as in ipo.networks",
+    r"ipo\.rollouts\.check_device": "is a check itself; Training shows it",
     r"ipo\.own_domains\.default_settings": "PPOSettings checks",
     r"ipo\.ppo\.Training\.(respond|improve)": LOOP,
     r"ipo\.ppo\.(minibatches|clipped_loss|standardize|clip_gradients)": LOOP,

@@ -289,7 +289,7 @@ BOX = spaces.Box(-1, 1, (2,), np.float32)
 @pytest.mark.parametrize(
     ("domains", "error", "message"),
     [
-        ([Line], TypeError, "must map names"),
+        ([Line], TypeError, "must be of type Mapping"),
         ({"a": Line(), "b": Line}, TypeError, r"domains\['a'\] = .*must be a function"),
         ({"a": Line, "b": list}, TypeError, r"domains\['b'\]\(\) = \[\]: must be a gymnasium.Env"),
         (dict.fromkeys("ab", lambda e=Line(): e), ValueError, "must make a new one at each call"),  # noqa: B008
@@ -339,10 +339,10 @@ def test_domains_that_do_not_fit_are_errors_before_any_training(domains, error, 
 @pytest.mark.parametrize(
     ("error", "network", "message"),
     [
-        (TypeError, "dense", "network = 'dense': must be an ipo.networks.Network"),
-        (ValueError, DenseNetwork(4, 2, Categorical), "does not take observations"),
-        (ValueError, DenseNetwork(3, 5, Categorical), "does not give actions"),
-        (ValueError, DenseNetwork(3, 2, Gaussian), "does not give actions"),
+        (TypeError, "dense", "network = 'dense': must be of type Network"),
+        (ValueError, DenseNetwork(4, 2, Categorical), "must take observations"),
+        (ValueError, DenseNetwork(3, 5, Categorical), "must give actions"),
+        (ValueError, DenseNetwork(3, 2, Gaussian), "must give actions"),
     ],
 )
 def test_a_network_that_does_not_fit_is_an_error_before_any_training(error, network, message):

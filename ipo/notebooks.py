@@ -1,4 +1,4 @@
-"""The parameters that papermill hands to a notebook."""
+"""The parameters that papermill hands to a notebook, for those of the book and your own."""
 
 from __future__ import annotations
 
