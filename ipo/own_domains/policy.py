@@ -74,15 +74,14 @@ class Policy:
 
     @classmethod
     def load(cls, path: str | os.PathLike, network: Network | None = None) -> Policy:
-        """What ``save`` wrote. Checksums are compared, and no code of the file is executed.
+        """What ``save`` wrote. No code of the file is executed; a damaged one is an error of zip.
 
         Args:
             path: of the file.
-            network: that it was trained with; if none is given, that of :func:`network_for`.
+            network: of the training; if none is given, that of :func:`ipo.policy.network_for`.
 
         Raises:
             ValueError: a file of something else, or of another network.
-            zipfile.BadZipFile: a damaged file.
         """
         arrays = {}
         if zipfile.is_zipfile(path):
