@@ -131,7 +131,7 @@ def check_network(network: Network, observations: Space, actions: Space) -> None
     name = type(network).__name__
     try:
         parameters, _ = network(network.start(generators), seen)
-    except RuntimeError as error:
+    except (RuntimeError, ValueError) as error:  # torch's, NumPy's
         raise ValueError(f"network: {name} must take observations {observations}") from error
     action = network.distribution.sample(parameters, generators)[0, 0]
     num_choices = parameters.shape[-1] if isinstance(actions, Discrete) else None

@@ -277,6 +277,9 @@ class Nowhere:
     def reset(self) -> Tensor:
         return torch.zeros(2, 4)
 
+    def step(self, actions: Tensor) -> Step:
+        raise AssertionError("nothing must be collected")
+
 
 def in_training(settings: PPOSettings, num_players: int = 1) -> Training:
     """Two runs of players who learn from a table with five rows, with frames by hand."""
