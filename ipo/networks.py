@@ -19,13 +19,11 @@ from typing import Annotated, Any
 import numpy as np
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from ipo.checks import Count, checked
 from ipo.distributions import Categorical, Distribution, Gaussian, Generators
 from ipo.game import average
 
-KINDS = ("weight", "bias")  # of numbers in a layer
 PIECE = 256  # rows of a table that are evaluated together
 
 Weights = dict[str, Tensor]
@@ -126,10 +124,15 @@ class DenseNetwork(Network):
 
     def __call__(self, weights: Weights, observations: Tensor) -> Outputs:
         """``observations [R, B, O]`` -> parameters ``[R, B, P]``, values ``[R, B]``."""
-        parameters, values = (
-            tanh_layers(weights, self.layers[part], observations) for part in ("actor", "critic")
-        )
-        values = values.squeeze(-1)
+
+        def outputs(part: str) -> Tensor:
+            x = observations
+            *hidden, last = self.layers[part]
+            for layer in hidden:
+                x = Tanh.apply(dense(weights, layer, x))
+            return dense(weights, last, x)
+
+        parameters, values = outputs("actor"), outputs("critic").squeeze(-1)
         if self.distribution is Gaussian:
             deviation = weights["log_std"].exp().unsqueeze(1)
             parameters = torch.cat([parameters, deviation.expand_as(parameters)], -1)
@@ -151,8 +154,11 @@ class DenseNetwork(Network):
             deviation = np.mean([np.exp(own["log_std"]) for own in weights], 0)[:, None]
 
         def outputs(own: dict[str, np.ndarray], part: str, x: np.ndarray) -> np.ndarray:
-            names = (f"{layer}.{kind}" for layer in self.layers[part] for kind in KINDS)
-            return _inputs_and_output(x, [own[name] for name in names])[-1]
+            for layer in self.layers[part]:
+                x = x @ own[f"{layer}.weight"] + own[f"{layer}.bias"][:, None]
+                if layer != self.layers[part][-1]:
+                    x = np.tanh(x)
+            return x
 
         def policy(observations: Tensor) -> Outputs:
             x = observations.numpy()
@@ -223,8 +229,8 @@ class GridNetwork(Network):
         num_images = x.shape[1]
         x = dense(weights, "conv2", x.flatten(1, 2)).relu()  # [R, 4 B, 32]
         x = dense(weights, "conv3", x.unflatten(1, (num_images, 4)).flatten(2)).relu()
-        logits = tanh_layers(weights, ("actor1", "actor2"), x)
-        values = tanh_layers(weights, ("critic1", "critic2"), x)
+        logits = dense(weights, "actor2", Tanh.apply(dense(weights, "actor1", x)))
+        values = dense(weights, "critic2", Tanh.apply(dense(weights, "critic1", x)))
         return logits, values.squeeze(-1)
 
 
@@ -312,65 +318,25 @@ def copied(players: Sequence[Weights]) -> list[Weights]:
     return [{name: w.detach().clone() for name, w in player.items()} for player in players]
 
 
-def in_one_row(weights: Weights) -> tuple[Tensor, Weights]:
-    """A copy with all weights of a run in one row ``[R, P]``, and its parts by name.
-
-    They share their memory, so an optimiser has one tensor to move instead of many.
-    """
-    rows = torch.cat([w.flatten(1) for w in weights.values()], 1)
-    parts = rows.split([w[0].numel() for w in weights.values()], 1)
-    named = zip(weights.items(), parts, strict=True)
-    return rows, {name: part.unflatten(1, w.shape[1:]) for (name, w), part in named}
-
-
 def dense(weights: Weights, name: str, x: Tensor) -> Tensor:
     """A layer by name: ``x [R, B, inputs] -> [R, B, units]``."""
     return torch.baddbmm(weights[f"{name}.bias"].unsqueeze(1), x, weights[f"{name}.weight"])
 
 
-def tanh_layers(weights: Weights, names: Sequence[str], x: Tensor) -> Tensor:
-    """Layers by name with tanh between them: ``x [R, B, inputs] -> [R, B, units]``."""
-    if x.device.type != "cpu":
-        *hidden, last = names
-        for name in hidden:
-            x = dense(weights, name, x).tanh()
-        return dense(weights, last, x)
-    own = (weights[f"{name}.{part}"] for name in names for part in KINDS)
-    return _TanhLayers.apply(x, *own)
-
-
-class _TanhLayers(torch.autograd.Function):
-    """In NumPy, as one step of the graph: torch takes twice as long for small minibatches."""
+class Tanh(torch.autograd.Function):
+    """The hyperbolic tangent by NumPy, which is ten times as fast as torch's on the CPU."""
 
     @staticmethod
-    def forward(ctx: Any, x: Tensor, *weights: Tensor) -> Tensor:
-        arrays = [weight.detach().numpy() for weight in weights]
-        ctx.inputs = _inputs_and_output(x.detach().numpy(), arrays)
-        ctx.matrices = arrays[::2]
-        return torch.from_numpy(ctx.inputs.pop())
+    def forward(ctx: Any, x: Tensor) -> Tensor:
+        on_cpu = x.device.type == "cpu"
+        y = torch.from_numpy(np.tanh(x.detach().numpy())) if on_cpu else x.tanh()
+        ctx.save_for_backward(y)
+        return y
 
     @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, ...]:
-        slope = gradient.numpy()
-        found: list[np.ndarray] = []
-        for x, matrix in reversed(list(zip(ctx.inputs, ctx.matrices, strict=True))):
-            found = [x.swapaxes(1, 2) @ slope, slope.sum(1), *found]
-            if x is not ctx.inputs[0]:
-                slope = (slope @ matrix.swapaxes(1, 2)) * (1 - x * x)  # x is a tanh
-            elif ctx.needs_input_grad[0]:
-                slope = slope @ matrix.swapaxes(1, 2)
-        return tuple(map(torch.from_numpy, [slope, *found]))
-
-
-def _inputs_and_output(x: np.ndarray, weights: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """What goes into each of the layers ``weight, bias, weight, bias ...``, and what comes out."""
-    values = [x]
-    for i in range(0, len(weights), 2):
-        y = values[-1] @ weights[i]
-        y += weights[i + 1][:, None]
-        values.append(y if i == len(weights) - 2 else np.tanh(y, out=y))
-    return values
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:
+        (y,) = ctx.saved_tensors
+        return torch.ops.aten.tanh_backward(gradient, y)  # gradient (1 - y^2), in one pass
 
 
 def _orthogonal(shape: tuple[int, int], generator: np.random.Generator) -> np.ndarray:

@@ -29,7 +29,7 @@ from ipo.checks import (
 )
 from ipo.distributions import Distribution, Generators
 from ipo.game import domains_of_players, play_round
-from ipo.networks import Network, OnTable, Weights, chosen_rows, in_one_row
+from ipo.networks import Network, OnTable, Weights, chosen_rows
 from ipo.rollouts import Collector, Device, Environments, Rollout, TimeOuts
 
 METHODS = ("ppo", "ipo", "ensemble")
@@ -180,16 +180,13 @@ class Training:
             [np.random.default_rng(stream[i]) for stream in streams] for i in range(3)
         )
         self.network, self.settings, self.num_frames = network, settings, 0
-        drawn = [network.start(self.draws) for _ in owned]
-        starts = [in_one_row({name: w.to(device) for name, w in own.items()}) for own in drawn]
-        self.rows, self.players = map(list, zip(*starts, strict=True))
+        starts = [network.start(self.draws) for _ in owned]
+        self.players = [{name: w.to(device) for name, w in own.items()} for own in starts]
+        leaves = [[w.requires_grad_() for w in player.values()] for player in self.players]
         self.optimizers = [
-            torch.optim.Adam([own], settings.learning_rate, eps=settings.adam_epsilon, fused=True)
-            for own in self.rows
+            torch.optim.Adam(own, settings.learning_rate, eps=settings.adam_epsilon, fused=True)
+            for own in leaves
         ]
-        for player in self.players:
-            for weight in player.values():
-                weight.requires_grad_()
         environments = [
             make_environments(domains, own, self.resets)
             for domains, own in zip(owned, copies, strict=True)
@@ -233,11 +230,12 @@ class Training:
             frames = frames._replace(advantages=standardize(frames.advantages))
         for epoch in range(settings.num_epochs):
             skip = settings.skip_last_frames and epoch % 2 == 1
-            for batch, theirs in minibatches(frames, others, settings, self.orders, skip):
+            for chosen in minibatches(frames, settings, self.orders, skip):
+                batch = Rollout(*(chosen_rows(x, chosen) for x in frames))
                 parameters, values = self.network(player, batch.observations)
                 if others:
-                    parameters = theirs[0] + share * parameters
-                    values = theirs[1] + share * values
+                    parameters = chosen_rows(others[0], chosen) + share * parameters
+                    values = chosen_rows(others[1], chosen) + share * values
                 loss = clipped_loss(self.network.distribution, parameters, values, batch, settings)
                 self._descend(d, loss)
 
@@ -250,9 +248,12 @@ class Training:
         return [(1 - share) * part for part in self.network.frozen(others)(observations)]
 
     def _descend(self, d: int, loss: Tensor) -> None:
-        gradients = torch.autograd.grad(loss.sum(), list(self.players[d].values()))
-        in_rows = torch.cat([gradient.flatten(1) for gradient in gradients], 1)
-        self.rows[d].grad = clip_gradient(in_rows, self.settings.max_gradient_norm)
+        leaves = list(self.players[d].values())
+        gradients = torch.autograd.grad(loss.sum(), leaves)
+        clipped = clip_gradients(gradients, self.settings.max_gradient_norm)
+        for leaf, gradient in zip(leaves, clipped, strict=True):
+            # The fused Adam pairs weights and gradients by their place in memory.
+            leaf.grad = gradient.contiguous()
         self.optimizers[d].step()
 
     @torch.no_grad()
@@ -297,24 +298,15 @@ class Training:
 
 
 def minibatches(
-    frames: Rollout,
-    others: Sequence[Tensor],
-    settings: PPOSettings,
-    generators: Generators,
-    skip_last_frames: bool,
-) -> Iterator[tuple[Rollout, list[Tensor]]]:
-    """``[R, B]`` of the frames and of ``others``, in an order of each run's own."""
-    num_frames = frames.actions.shape[1]
-    numbers = np.arange(num_frames)
+    frames: Rollout, settings: PPOSettings, generators: Generators, skip_last_frames: bool
+) -> Iterator[Tensor]:
+    """Indices ``[R, B]`` of frames in an order of each run's own."""
+    numbers = np.arange(frames.actions.shape[1])
     if skip_last_frames:
         numbers = numbers[(numbers + 1) % settings.num_steps != 0]
     order = torch.tensor(np.stack([generator.permutation(numbers) for generator in generators]))
     order = order.to(frames.actions.device)
-    size = settings.size_of_minibatches(num_frames)
-    # All in order at once, then in slices: cheaper than to choose for each minibatch.
-    columns = [chosen_rows(x, order).split(size, dim=1) for x in (*frames, *others)]
-    for batch in zip(*columns, strict=True):
-        yield Rollout(*batch[: len(frames)]), list(batch[len(frames) :])
+    yield from order.split(settings.size_of_minibatches(frames.actions.shape[1]), dim=1)
 
 
 def clipped_loss(
@@ -355,7 +347,8 @@ def standardize(gains: Tensor) -> Tensor:
     return (gains - gains.mean(1, True)) / (gains.std(1, keepdim=True) + 1e-8)
 
 
-def clip_gradient(gradient: Tensor, max_norm: float) -> Tensor:
-    """A player's gradient ``[R, P]``, scaled so that its norm is at most max_norm in each run."""
-    norm = torch.linalg.vector_norm(gradient, dim=1, keepdim=True)
-    return gradient * (max_norm / norm).clamp(max=1.0)
+def clip_gradients(gradients: Sequence[Tensor], max_norm: float) -> list[Tensor]:
+    """Gradients ``[R, ...]`` of a player, scaled so that their joint norm is at most max_norm."""
+    squares = torch.stack([gradient.flatten(1).square().sum(1) for gradient in gradients])
+    scale = (max_norm / squares.sum(0).sqrt()).clamp(max=1.0)
+    return [g * scale.reshape(-1, *[1] * (g.dim() - 1)) for g in gradients]

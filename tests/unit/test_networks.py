@@ -1,6 +1,5 @@
 """The grid network against torch.nn, the average by hand, tables, and files of weights."""
 
-import itertools
 import math
 
 import numpy as np
@@ -13,15 +12,7 @@ from small import DoubleNetwork, assert_close, plain_network
 from torch import Tensor
 
 from experiments.policies import load_policy, save_policy
-from ipo.networks import (
-    GridNetwork,
-    Network,
-    OnTable,
-    Weights,
-    copied,
-    in_one_row,
-    tanh_layers,
-)
+from ipo.networks import GridNetwork, Network, OnTable, Weights, copied
 
 
 def generators(*seeds: int) -> list[np.random.Generator]:
@@ -81,46 +72,6 @@ def test_gradient_is_that_of_torch():
         assert_close(weights["actor1.bias"].grad[run], grads[1])
         first = plain.convolutions[0].weight.grad.permute(2, 3, 1, 0).flatten(0, 2)
         assert_close(weights["conv1.weight"].grad[run], first)
-
-
-@pytest.mark.parametrize("through", ["weights", "inputs and weights"])
-@pytest.mark.parametrize("hidden", [(), (4,), (4, 3)])
-def test_gradient_of_tanh_layers_is_that_of_torch(hidden, through):
-    sizes = list(itertools.pairwise([5, *hidden, 2]))
-    names = [str(i) for i in range(len(sizes))]
-    rng = np.random.default_rng(0)
-    weights = {}
-    for name, (inputs, units) in zip(names, sizes, strict=True):
-        weights[f"{name}.weight"] = torch.tensor(rng.normal(size=(3, inputs, units)))
-        weights[f"{name}.bias"] = torch.tensor(rng.normal(size=(3, units)))
-    x = torch.tensor(rng.normal(size=(3, 7, 5)))
-    leaves = [*weights.values(), *([x] if through != "weights" else [])]
-    for leaf in leaves:
-        leaf.requires_grad_()
-
-    def plain(x: Tensor) -> Tensor:
-        for name in names:
-            x = x @ weights[f"{name}.weight"] + weights[f"{name}.bias"].unsqueeze(1)
-            x = x if name == names[-1] else x.tanh()
-        return x
-
-    ours, theirs = tanh_layers(weights, names, x), plain(x)
-    assert_close(ours, theirs.detach())
-    weighting = torch.tensor(rng.normal(size=ours.shape))
-    for own, expected in zip(
-        torch.autograd.grad((weighting * ours).sum(), leaves),
-        torch.autograd.grad((weighting * theirs).sum(), leaves),
-        strict=True,
-    ):
-        assert_close(own, expected)
-
-
-def test_weights_in_one_row_change_together():
-    weights = GridNetwork().start(generators(0, 1))
-    rows, parts = in_one_row(weights)
-    assert all(torch.equal(parts[name], weight) for name, weight in weights.items())
-    rows.zero_()
-    assert rows.shape == (2, 19384) and not any(part.any() for part in parts.values())
 
 
 def test_single_precision_is_near_double_precision():
