@@ -92,21 +92,21 @@ def compared(part: Slice, rows: pd.DataFrame) -> str:
     """How rows that were computed again compare with the shipped ones."""
     store = Store(DATA / "results" / part.chapter, part.name)
     recorded = store.rows_of(part.batch)
-    if how := agreement(part.chapter, recorded, rows):
+    if how := agreement(f"{part.chapter}/{part.name}", recorded, rows):
         return how
     both = side_by_side(recorded, rows)
     chaotic = both is not None and f"{part.chapter}/{part.name}" in CHAOTIC
     return "alike" if chaotic and alike(store.rows(), part.batch["columns"], both) else "differs"
 
 
-def agreement(chapter: str, recorded: pd.DataFrame, rows: pd.DataFrame) -> str | None:
+def agreement(experiment: str, recorded: pd.DataFrame, rows: pd.DataFrame) -> str | None:
     """Whether rows are ``exact`` or ``close``; None: neither."""
     both = side_by_side(recorded, rows)
     if both is None:
         return None
     if (both["value"] == both["value_now"]).all():
         return "exact"
-    return "close" if within(both, chapter, LONGER).all() else None
+    return "close" if within(both, experiment, LONGER).all() else None
 
 
 def alike(shipped: pd.DataFrame, columns: dict[str, Any], both: pd.DataFrame) -> bool:

@@ -157,7 +157,7 @@ def comparison(chapters: Sequence[str]) -> pd.DataFrame:
 def outcome(chapter: str, name: str, shipped: pd.DataFrame, again: pd.DataFrame) -> str:
     """How all runs of a cell compare with the shipped ones."""
     trained = f"{chapter}/{name}" in CHAOTIC or CHAPTERS[chapter][name].reads is not None
-    how = agreement(chapter, shipped, again)
+    how = agreement(f"{chapter}/{name}", shipped, again)
     return how or ("alike" if trained and alike(shipped, again) else "differs")
 
 

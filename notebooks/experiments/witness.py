@@ -39,6 +39,7 @@ TOLERANCE = {
     "lqr": (1e-4, 1e-5),
     "causality": (1e-4, 1e-6),
     "algorithm": (1e-6, 1e-9),
+    "algorithm/players": (1e-3, 1e-5),  # networks, as in keys
     "keys": (1e-3, 1e-5),
     "door": (1e-3, 1e-5),
     "your_own_domains": (1e-2, 1e-3),  # episodes of a pendulum are chaotic
@@ -109,7 +110,7 @@ def differences(part: Slice, rows: pd.DataFrame | str) -> list[str]:
         return [f"{title}: has other rows than the {len(recorded)} that were recorded"]
     return [
         f"{title}: {describe(row)}: {row['value']:.9g} recorded, {row['value_now']:.9g} now"
-        for row in both[~within(both, part.chapter)].to_dict("records")
+        for row in both[~within(both, f"{part.chapter}/{part.name}")].to_dict("records")
     ]
 
 
@@ -126,9 +127,10 @@ def side_by_side(recorded: pd.DataFrame, rows: pd.DataFrame) -> pd.DataFrame | N
     return both
 
 
-def within(both: pd.DataFrame, chapter: str, factor: float = 1.0) -> pd.Series:
-    """Which values are the same within the chapter's tolerance, or so many times as much."""
-    relative, absolute = TOLERANCE[chapter]
+def within(both: pd.DataFrame, experiment: str, factor: float = 1.0) -> pd.Series:
+    """Which values are the same within the tolerance of ``chapter/name``, or a multiple of it."""
+    chapter, _ = experiment.split("/")
+    relative, absolute = TOLERANCE.get(experiment, TOLERANCE[chapter])
     old, new = both["value"], both["value_now"]
     allowed = relative * old.abs() + absolute + both["metric"].map(FLIPS).fillna(0.0)
     allowed *= factor
