@@ -73,6 +73,14 @@ def check_choice(name: str, value: object, choices: Iterable[str]) -> None:
         raise ValueError(f"{name} = {value!r}: must be one of {', '.join(choices)}{hint}")
 
 
+def check_choices(name: str, values: object, choices: Sequence[str]) -> None:
+    """A list of some of ``choices``."""
+    if isinstance(values, str) or not isinstance(values, Sequence) or not values:
+        raise ValueError(f"{name} = {values!r}: must be a list of some of {', '.join(choices)}")
+    for index, value in enumerate(values):
+        check_choice(f"{name}[{index}]", value, choices)
+
+
 def check_counts(name: str, values: object, minimum: int = 1, maximum: int | None = None) -> None:
     """A list of different whole numbers within the bounds, not empty."""
     if isinstance(values, str | bytes) or not isinstance(values, Sequence):
@@ -83,6 +91,16 @@ def check_counts(name: str, values: object, minimum: int = 1, maximum: int | Non
         check_count(f"{name}[{index}]", value, minimum, maximum)
     if len(set(values)) < len(values):
         raise ValueError(f"{name} = {values!r}: must not name a value twice")
+
+
+def check_numbers(name: str, values: object, length: int = 1, **bounds: float) -> None:
+    """A list of at least so many finite numbers within the bounds."""
+    if isinstance(values, str | bytes) or not isinstance(values, Sequence):
+        raise TypeError(f"{name} = {values!r}: must be a list of numbers")
+    if len(values) < length:
+        raise ValueError(f"{name} = {values!r}: must have at least {length} numbers")
+    for index, value in enumerate(values):
+        check_number(f"{name}[{index}]", value, **bounds)
 
 
 def check_checkpoints(checkpoints: Iterable[int], end: int) -> None:
