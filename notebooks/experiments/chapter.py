@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import sys
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -19,7 +20,7 @@ from experiments import figures, tables
 from experiments.experiment import Cell, Experiment, Places, rebuilt
 from experiments.origin import ROOT
 from experiments.paper import read_paper
-from experiments.store import Store, timed
+from experiments.store import Batch, Store, timed
 from ipo.checks import Count, checked
 
 
@@ -73,8 +74,22 @@ class Chapter:
 
     def rows(self, name: str, cells: Sequence[Cell], seeds: Sequence[int]) -> pd.DataFrame:
         """Rows of an experiment: shipped ones are loaded, missing ones are computed and kept."""
-        experiment = self.experiments[name].at(self.places)
-        return Store(self.folder, name).fill(experiment, cells, list(seeds), self.workers)
+        experiment, seeds = self.experiments[name].at(self.places), list(seeds)
+        store = Store(self.folder, name)
+        self._announce(name, sum(len(store.lacking(experiment, cell, seeds)) for cell in cells))
+        return store.fill(experiment, cells, seeds, self.workers)
+
+    def _announce(self, name: str, num_missing: int) -> None:
+        """Say how long missing runs take, if they are like the shipped ones."""
+        shipped = Store(self.shipped, name).batches()
+        if num_missing and shipped:
+            num_shipped = sum(len(batch["seeds"]) for batch in shipped)
+            minutes = self.minutes_of(shipped) * num_missing / num_shipped / self.workers
+            print(
+                f"{name}: {num_missing} runs are missing. At the mean cost of the shipped ones "
+                f"they take {minutes:.1f} minutes on {self.workers} cores; each batch is kept",
+                file=sys.stderr,
+            )
 
     def slices(self, name: str, **columns: Any) -> tuple[pd.DataFrame, pd.DataFrame]:
         """What the short slices of the cells with these columns give now, and all recorded ones.
@@ -103,7 +118,12 @@ class Chapter:
 
     def minutes(self, name: str) -> float:
         """CPU-minutes that an experiment took."""
-        return sum(b["cpu_seconds"] for b in Store(self.folder, name).batches()) / 60
+        return self.minutes_of(Store(self.folder, name).batches())
+
+    @staticmethod
+    def minutes_of(batches: Sequence[Batch]) -> float:
+        """CPU-minutes by their record."""
+        return sum(batch["cpu_seconds"] for batch in batches) / 60
 
 
 def numbers(prefix: str, **values: Any) -> None:
