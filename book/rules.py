@@ -294,7 +294,11 @@ def strategies_come_back(
     for role, arm in (("hook", hooking), ("outside", outside)):
         where = {"metric": "inside_part", "domain": domain, **arm}
         cells.runs(**where)  # complete, or no verdict
-        names = cells.select(**where).groupby("run")["value"].agg(strategy_of_policy)
+        names = (
+            cells.select(**where)
+            .groupby("run")["value"]
+            .agg(lambda parts: strategy_of_policy(parts.tolist()))
+        )
         counts[role] = names.value_counts().reindex(["hook", "mixed", "outside"], fill_value=0)
     evidence = "; ".join(
         f"{NAMES[arm['method']]}: " + ", ".join(f"{n} {name}" for name, n in counts[role].items())

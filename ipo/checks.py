@@ -174,7 +174,9 @@ def _check_numbers(name: str, value: Any, sizes: dict[str, Any]) -> None:
         raise TypeError(f"{name}: holds {value.dtype}, must hold real numbers")
     if not bool((np.isfinite(value) if array else value.isfinite()).all()):
         raise ValueError(f"{name}: holds NaN or infinite values, must be finite")
-    if not array and sizes.setdefault("dtype", value.dtype) != value.dtype:
+    if array or value.dim() == 0:  # a number takes the type of what it meets
+        return
+    if sizes.setdefault("dtype", value.dtype) != value.dtype:
         raise TypeError(f"{name}: holds {value.dtype}, must hold {sizes['dtype']} as the others")
 
 

@@ -96,8 +96,12 @@ def rebuilt(kind: Any, value: Any) -> Any:
 
 
 def plain(tree: Any) -> Any:
-    """Values, dataclasses among them, as they come back from JSON."""
-    return json.loads(json.dumps(tree, default=dataclasses.asdict))
+    """Values, dataclasses and NumPy's numbers among them, as they come back from JSON."""
+
+    def of(value: Any) -> Any:
+        return value.item() if hasattr(value, "item") else dataclasses.asdict(value)
+
+    return json.loads(json.dumps(tree, default=of))
 
 
 def filled(kind: Any, recorded: Any) -> Any:

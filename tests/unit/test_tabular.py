@@ -274,12 +274,12 @@ def test_lockstep_with_minigrid(explored, index_of, keys, colors):
     ],
 )
 def test_any_draw_starts_in_the_domain_of_the_copy(keys, uniform):
-    class Fixed:
+    class Fixed(np.random.Generator):
         def random(self, size: int) -> np.ndarray:
             return np.full(size, uniform)
 
     domains = TabularDomains([keys[color] for color in COLORS])
-    copies = domains(range(6), 1, [Fixed()])
+    copies = domains(range(6), 1, [Fixed(np.random.PCG64())])
     copies.reset()
     assert (copies.state // 520).tolist() == [list(range(6))]
     assert (keys["red"].start[copies.state % 520] > 0).all()

@@ -61,7 +61,11 @@ def strategy_examples(parts: pd.DataFrame, friction: float, number: int = 3) -> 
 
 def strategies(parts: pd.DataFrame, cell: Cell, friction: float) -> pd.Series:
     """The strategy of every run's policy."""
-    return of_arm(parts, cell, friction).groupby("run")["value"].agg(strategy_of_policy)
+    return (
+        of_arm(parts, cell, friction)
+        .groupby("run")["value"]
+        .agg(lambda parts: strategy_of_policy(parts.tolist()))
+    )
 
 
 def table_of_strategies(
