@@ -35,7 +35,8 @@ PROFILES = {
     "other_list": "plain: {num_runs: [3]}\n",
 }
 FILES = {
-    "_config.yml": "title: A toy\nonly_build_toc_files: true\nexecute: {execute_notebooks: 'off'}\n",
+    "_config.yml": "title: A toy\nonly_build_toc_files: true\n"
+    "execute: {execute_notebooks: 'off'}\n",
     "_toc.yml": "format: jb-book\nroot: intro\nchapters: [{file: plain}, {file: painted}, "
     "{file: run_times}, {file: licences}]\n",
     "environment.txt": "numpy==2\n",
