@@ -81,7 +81,7 @@ def train_policy(
         method: how to train.
         seeds: the runs, which are trained side by side.
         settings: instead of :func:`default_settings` of the method.
-        network: instead of that of :func:`ipo.policy.network_for`.
+        network: instead of that of :func:`ipo.own_domains.policy.network_for`.
         label: the method's name in rows; the method itself if none is given.
         device: where networks learn, such as ``cuda``; the policy comes back to the CPU.
         changes: of the settings, such as ``num_updates=50``.

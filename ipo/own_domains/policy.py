@@ -30,7 +30,8 @@ class Policy:
     Attributes:
         label: the method's name in rows.
         seeds: of the runs.
-        observations, actions: the spaces that they were trained with.
+        observations: the space that they were trained with.
+        actions: likewise.
         network: of every player.
         players: the weights ``{name: [R, ...]}`` of every player; their average acts.
     """
@@ -78,7 +79,8 @@ class Policy:
 
         Args:
             path: of the file.
-            network: of the training; if none is given, that of :func:`ipo.policy.network_for`.
+            network: of the training; if none is given, that of
+                :func:`ipo.own_domains.policy.network_for`.
 
         Raises:
             ValueError: a file of something else, or of another network.
