@@ -17,7 +17,7 @@ def run(cell, seeds): time.sleep(100)
 toy_experiment.fill(sys.argv[1], run=run, num_workers=2)"""
 BUILD = "import sys; from pathlib import Path; from build import main; main([], Path(sys.argv[1]))"
 CELL = """import time, joblib
-from experiments.workers import parallel
+from experiments.work import parallel
 parallel(2)(joblib.delayed(time.sleep)(100) for _ in range(2))"""
 FILES = {
     "_toc.yml": "format: jb-book\nroot: sleepy\n",
