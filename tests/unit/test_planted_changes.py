@@ -88,7 +88,7 @@ CHANGES = {
         "causality/linear",
     ),
     "rewards of the evaluation": (
-        "ipo/own_domains.py",
+        "ipo/own_domains/__init__.py",
         "returns += running * step.reward",
         "returns += step.reward",
         "your_own_domains",
@@ -134,8 +134,8 @@ CLEAN_UPS = {
     "a name": ("ipo/game.py", r"\bshare\b", "part_of_one", "algorithm/table"),
     "an error's text": (
         "ipo/checks.py",
-        "must be at least",
-        "has to be at least",
+        "must not name a value twice",
+        "must name no value twice",
         "lqr/closed_form",
     ),
     "a docstring": ("ipo/lqr.py", '"""Solve ``P', '"""By doubling, solve ``P', "lqr/curves"),
@@ -177,7 +177,7 @@ CLEAN_UPS = {
     ),
     "another order of functions": (
         "ipo/causality/predictors.py",
-        r"(?s)(def irm_penalties.*?\n\n\n)(def vrex.*?\n\n\n)",
+        r"(?s)(def irm_penalties.*?\n\n\n)(@checked\ndef vrex.*?\n\n\n)",
         r"\2\1",
         "causality/digits",
     ),
