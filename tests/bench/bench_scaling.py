@@ -47,21 +47,20 @@ SWEEP = WHOLE | {"door/curves": (replace(DOOR, settings=shorter(ONE_UPDATE)), 1)
 NUM_OF_EACH = 2
 
 
-def seconds(name: str, cell: Cell, num_runs: int, folder: Path, number: int = 0) -> float:
-    """CPU-seconds of a job. Trainings of the same seed need different folders for check-points."""
+def seconds(name: str, cell: Cell, num_runs: int, folder: Path) -> float:
+    """CPU-seconds of a job from nothing: what it saves is its own, but for the tables."""
     chapter, experiment = name.split("/")
-    places = Places(folder / "tables", folder / "policies", folder / f"checkpoints_{number}")
-    run = CHAPTERS[chapter][experiment].at(places).run
-    with threadpool_limits(1):  # as in the workers, where this process computes alone
+    one_thread = threadpool_limits(1)  # as in the workers, where this process computes alone
+    with one_thread, TemporaryDirectory(dir=folder) as own:
+        places = Places(folder / "tables", Path(own) / "policies", Path(own) / "checkpoints")
+        run = CHAPTERS[chapter][experiment].at(places).run
         return timed(run, cell, list(range(num_runs)))[2]["cpu_seconds"]
 
 
 def sweep(num_workers: int, folder: Path) -> dict[str, float]:
     """Wall and CPU-seconds of all jobs; the workers are there before."""
     jobs = [
-        partial(seconds, name, *SWEEP[name], folder, number)
-        for number in range(NUM_OF_EACH)
-        for name in SWEEP
+        partial(seconds, name, *SWEEP[name], folder) for _ in range(NUM_OF_EACH) for name in SWEEP
     ]
     list(finished([partial(time.sleep, 0.5)] * num_workers, num_workers))
     began = time.perf_counter()
