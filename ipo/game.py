@@ -1,4 +1,4 @@
-"""The game behind IPO: who owns which domains, one round of Algorithm 1, and the Nash gap.
+"""The game behind IPO: who moves on which domains, one round of Algorithm 1, and the Nash gap.
 
 Every player owns some training domains. The players' policies are averaged, and the average acts
 in all domains. In a round each player in turn changes its own weights so that the cost of *its*
@@ -7,6 +7,7 @@ domains falls, while the others stand still. All methods of the book are this ga
     pooled training (gradient descent, PPO)     one player that owns all domains
     IPO, IRM-Games                              a player for each domain
     ensemble                                    as many players, each of which owns all domains
+    one domain at a time                        one player, who moves on each domain in turn
 
 Players are linear controllers and predictors (:class:`LinearPlayers`, here) or networks
 (``ipo.ppo``); they all play :func:`play_round`.
@@ -17,7 +18,7 @@ Source: Algorithm 1 of Sonar, Pacelli and Majumdar (2021), after Ahuja et al. (2
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import torch
 from torch import Tensor
@@ -25,7 +26,7 @@ from torch import Tensor
 from ipo.checks import Count, Positive, check_count, checked, one_of
 from ipo.optimizers import descend
 
-OWNERSHIPS = ("pooled", "ipo", "ensemble")
+GAMES = ("pooled", "ipo", "ensemble", "in_turn")
 ORDERS = ("in_turn", "together")
 Order = Annotated[str, one_of(ORDERS)]
 
@@ -33,25 +34,32 @@ Cost = Callable[[Tensor], Tensor]  # policy [R, ...] -> [R]
 BestCosts = Annotated[Tensor, "R E"] | Annotated[Tensor, "R 1"]
 
 
-@checked
-def domains_of_players(
-    method: Annotated[str, one_of(OWNERSHIPS)], num_domains: Count
-) -> list[list[int]]:
-    """The domains that each player owns.
+class Move(NamedTuple):
+    """Who moves, and the domains whose cost is to fall."""
 
-    ``pooled`` is one player that owns all; in ``ipo`` each domain has a player of its own; an
-    ``ensemble`` has as many players as ``ipo``, and each owns all domains.
+    player: int
+    domains: list[int]
+
+
+@checked
+def moves(method: Annotated[str, one_of(GAMES)], num_domains: Count) -> list[Move]:
+    """The moves of a round.
+
+    ``pooled`` is one player that owns all domains; in ``ipo`` each domain has a player of its own;
+    an ``ensemble`` has as many players as ``ipo``, and each owns all domains. ``in_turn`` is a
+    control between them: one player that visits the domains as IPO's players do.
     """
     everything = list(range(num_domains))
     return {
-        "pooled": [everything],
-        "ipo": [[d] for d in everything],
-        "ensemble": [everything] * num_domains,
+        "pooled": [Move(0, everything)],
+        "ipo": [Move(d, [d]) for d in everything],
+        "ensemble": [Move(d, everything) for d in everything],
+        "in_turn": [Move(0, [d]) for d in everything],
     }[method]
 
 
 def play_round(
-    num_players: int,
+    num_moves: int,
     respond: Callable[[int], None],
     num_inner_rounds: int = 1,
     move_phi: Callable[[], None] | None = None,
@@ -59,18 +67,18 @@ def play_round(
     """One iteration of Algorithm 1, whatever the players are made of.
 
     Args:
-        num_players: E.
-        respond: ``respond(d)`` makes player d's move while the others stand still.
+        num_moves: one for each player, who own the domains; see :func:`moves`.
+        respond: ``respond(d)`` makes move d, while all other players stand still.
         num_inner_rounds: K; it is 1 in all runs of the paper.
         move_phi: lets the part that all players share make its move on the cost of all domains;
             ``None``: Phi is fixed.
     """
-    check_count("num_players", num_players)
+    check_count("num_moves", num_moves)
     check_count("num_inner_rounds", num_inner_rounds)
     if move_phi is not None:  # lines 2 to 6
         move_phi()
     for _ in range(num_inner_rounds):  # line 7
-        for d in range(num_players):  # line 8
+        for d in range(num_moves):  # line 8
             respond(d)  # lines 9 and 10: what the next player sees is the new average
 
 

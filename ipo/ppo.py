@@ -28,11 +28,11 @@ from ipo.checks import (
     one_of,
 )
 from ipo.distributions import Distribution, Generators
-from ipo.game import domains_of_players, play_round
+from ipo.game import Move, moves, play_round
 from ipo.networks import Network, OnTable, Weights, chosen_rows
 from ipo.rollouts import Collector, Device, Environments, Rollout, TimeOuts
 
-METHODS = ("ppo", "ipo", "ensemble")
+METHODS = ("ppo", "ipo", "ensemble", "in_turn")
 NORMALIZATIONS = ("none", "minibatch", "rollout")
 
 # (domains, how many copies of each, a generator for each run) -> environments
@@ -45,7 +45,8 @@ class PPOSettings:
     """How a policy is trained. Sizes and rates are those of the paper's coloured keys (Table 6).
 
     Attributes:
-        method: ``ppo``, ``ipo`` or ``ensemble``.
+        method: ``ppo``, ``ipo`` or ``ensemble``; or ``in_turn``, one network for all domains like
+            PPO's, trained on one domain at a time like IPO's.
         learning_rate: of Adam; the paper has 1e-3 for PPO and 5e-4 for IPO.
         adam_epsilon: keeps Adam's denominator from 0.
         num_updates: rounds, in each of which every player collects and learns once.
@@ -93,13 +94,13 @@ class PPOSettings:
     time_outs: TimeOuts = "bootstrap"
     skip_last_frames: bool = False
 
-    def domains_of_players(self, num_domains: int) -> list[list[int]]:
-        """The domains that each player owns; ``ppo`` is what the game calls ``pooled``."""
-        return domains_of_players("pooled" if self.method == "ppo" else self.method, num_domains)
+    def moves(self, num_domains: int) -> list[Move]:
+        """Of a round; ``ppo`` is what the game calls ``pooled``."""
+        return moves("pooled" if self.method == "ppo" else self.method, num_domains)
 
-    def copies_of_players(self, num_domains: int) -> list[list[int]]:
-        """How many copies each player has of each domain that it owns."""
-        owned = self.domains_of_players(num_domains)
+    def copies(self, num_domains: int) -> list[list[int]]:
+        """How many copies each move has of each of its domains."""
+        owned = [move.domains for move in self.moves(num_domains)]
         num_owners = len(owned) if len(owned[0]) > 1 else 1
         if not isinstance(self.num_envs, tuple):
             if self.num_envs % (num_domains * num_owners):
@@ -152,7 +153,8 @@ class Training:
 
     Attributes:
         players: weights of every player; they change in place.
-        collectors: every player's environments.
+        moves: of a round: who moves, on which domains.
+        collectors: the environments of every move.
         num_frames: seen so far, in each run.
 
     Raises:
@@ -171,8 +173,8 @@ class Training:
         seeds: Seeds,
         device: Device = "cpu",
     ) -> None:
-        owned = settings.domains_of_players(num_domains)
-        copies = settings.copies_of_players(num_domains)
+        self.moves = settings.moves(num_domains)
+        copies = settings.copies(num_domains)
         for own in copies:
             settings.size_of_minibatches(settings.num_steps * sum(own))
         streams = [np.random.SeedSequence(seed).spawn(3) for seed in seeds]
@@ -180,7 +182,8 @@ class Training:
             [np.random.default_rng(stream[i]) for stream in streams] for i in range(3)
         )
         self.network, self.settings, self.num_frames = network, settings, 0
-        starts = [network.start(self.draws) for _ in owned]
+        num_players = 1 + max(move.player for move in self.moves)
+        starts = [network.start(self.draws) for _ in range(num_players)]
         self.players = [{name: w.to(device) for name, w in own.items()} for own in starts]
         leaves = [[w.requires_grad_() for w in player.values()] for player in self.players]
         self.optimizers = [
@@ -188,8 +191,8 @@ class Training:
             for own in leaves
         ]
         environments = [
-            make_environments(domains, own, self.resets)
-            for domains, own in zip(owned, copies, strict=True)
+            make_environments(move.domains, own, self.resets)
+            for move, own in zip(self.moves, copies, strict=True)
         ]
         self.collectors = [settings.collector(own, device) for own in environments]
 
@@ -204,19 +207,19 @@ class Training:
             yield self.num_frames, self.players
 
     def update(self, only: int | None = None) -> None:
-        """One round of Algorithm 1; or the move of one player, while all else stands still."""
+        """One round of Algorithm 1; or one of its moves, while all else stands still."""
         if only is None:
-            play_round(len(self.players), self.respond, num_inner_rounds=1, move_phi=None)
+            play_round(len(self.moves), self.respond, num_inner_rounds=1, move_phi=None)
         else:
-            check_count("only", only, 0, len(self.players) - 1)
+            check_count("only", only, 0, len(self.moves) - 1)
             self.respond(only)
 
     def respond(self, d: int) -> None:
-        """Player d's move: it collects with the average of all players, and learns."""
+        """Move d: its player collects with the average of all players, and learns."""
         average = self.network.frozen(self.players)
         rollout = self.collectors[d].collect(average, self.network.distribution, self.draws)
         self.num_frames += rollout.values[0].numel()
-        self.improve(d, rollout.frames())
+        self.improve(self.moves[d].player, rollout.frames())
 
     def improve(self, d: int, frames: Rollout) -> None:
         """Some epochs of PPO for player d on frames ``[R, F]``, while the others stand still.

@@ -340,7 +340,15 @@ def short_if_small(cell: Cell) -> Cell | None:
 
 EXPERIMENTS = {
     name: Experiment(run_cell, Cell, short_if_small)
-    for name in ("tables", "starts", "more_domains", "closed_form", "optimizers", "controls")
+    for name in (
+        "tables",
+        "starts",
+        "more_domains",
+        "closed_form",
+        "optimizers",
+        "controls",
+        "turns",
+    )
 } | {
     "curves": Experiment(run_curve, Cell, short),
     "closed_loops": Experiment(run_closed_loops, Cell, short),

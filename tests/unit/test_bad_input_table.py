@@ -216,10 +216,10 @@ def rows_of_learning() -> Iterator[Row]:
         weights=LIST,
     )
     ownership = {"method": "ipo", "num_domains": 2}
-    yield row(game.domains_of_players, ownership)
+    yield row(game.moves, ownership)
     yield row(
         game.play_round,
-        {"num_players": 2, "respond": never},
+        {"num_moves": 2, "respond": never},
         respond="called at once",
         move_phi="called at once",
     )
@@ -281,7 +281,7 @@ def rows_of_learning() -> Iterator[Row]:
     copies = COUNT + bad("range", (), (0, 4), (4, 2.0))
     yield row(ppo.PPOSettings, {"method": "ipo"}, num_envs=copies)
     settings = ppo.PPOSettings("ipo", num_envs=4, minibatch_size=2, num_steps=4)
-    for function in (settings.domains_of_players, settings.copies_of_players):
+    for function in (settings.moves, settings.copies):
         yield row(function, {"num_domains": 2})
     yield row(settings.size_of_minibatches, {"num_frames": 8})
     yield row(settings.collector, {"environments": environments})

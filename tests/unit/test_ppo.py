@@ -21,6 +21,7 @@ from torch import Tensor
 
 from experiments.keys import published
 from ipo.distributions import Categorical
+from ipo.game import moves
 from ipo.networks import GridNetwork, OnTable, Weights, copied
 from ipo.ppo import (
     METHODS,
@@ -89,19 +90,19 @@ def of_gymnasium(
 
 def plain_runs(settings: PPOSettings, num_domains: int, seeds: Sequence[int]) -> list[list]:
     """What the plain loop makes of every run: its players after the last update."""
-    owned = settings.domains_of_players(num_domains)
+    movers, owned = zip(*settings.moves(num_domains), strict=True)
     copies = settings.num_envs // sum(map(len, owned))
     finished = []
     for r, seed in enumerate(seeds):
         draws, _, orders = streams(seed)
-        players = [plain_network(DoubleNetwork().start([draws])) for _ in owned]
+        players = [plain_network(DoubleNetwork().start([draws])) for _ in set(movers)]
         envs, firsts = [], []
         for domains in owned:
             fast = of_gymnasium(domains, [copies] * len(domains), seeds)
             num_copies = fast.envs.num_envs // len(seeds)
             firsts.append(fast.seeds[r * num_copies : (r + 1) * num_copies])
             envs.append([short_task(d) for d in domains for _ in range(copies)])
-        *_, players = plain_ppo.train(players, envs, settings, draws, orders, firsts)
+        *_, players = plain_ppo.train(players, envs, settings, draws, orders, firsts, movers=movers)
         finished.append(players)
     return finished
 
@@ -123,6 +124,7 @@ ARMS = {
     "IPO": ("ipo", 2, {}),
     "published IPO": ("ipo", 2, {"time_outs": "terminal", "skip_last_frames": True}),
     "ensemble": ("ensemble", 2, {"num_envs": 8}),
+    "one domain at a time": ("in_turn", 2, {}),
     "other numbers": (
         "ipo",
         2,
@@ -206,7 +208,7 @@ def test_same_seeds_learn_the_same(pair):
         assert all(torch.equal(ours[name], theirs[name]) for name in theirs)
 
 
-@pytest.mark.parametrize("method", ["ipo", "ensemble"])
+@pytest.mark.parametrize("method", ["ipo", "ensemble", "in_turn"])
 def test_one_domain_makes_every_method_ppo(keys, method):
     domains = TabularDomains([keys["blue"]])
     ((ppo,), (other,)) = (
@@ -216,13 +218,13 @@ def test_one_domain_makes_every_method_ppo(keys, method):
     assert all(torch.equal(ppo[name], other[name]) for name in ppo)
 
 
-def test_number_of_players_and_what_they_own():
-    assert PPOSettings("ppo").domains_of_players(3) == [[0, 1, 2]]
-    assert PPOSettings("ipo").domains_of_players(3) == [[0], [1], [2]]
-    assert PPOSettings("ensemble").domains_of_players(3) == [[0, 1, 2]] * 3
+def test_ppo_is_the_pooled_game():
+    assert PPOSettings("ppo").moves(3) == moves("pooled", 3)
 
 
-@pytest.mark.parametrize(("method", "num_players"), [("ppo", 1), ("ipo", 3), ("ensemble", 3)])
+@pytest.mark.parametrize(
+    ("method", "num_players"), [("ppo", 1), ("ipo", 3), ("ensemble", 3), ("in_turn", 1)]
+)
 def test_three_domains(keys, method, num_players):
     domains = TabularDomains([keys[color] for color in ("red", "green", "blue")])
     settings = PPOSettings(method, **(SMALL | {"num_envs": 9, "num_updates": 1}))
