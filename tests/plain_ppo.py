@@ -43,8 +43,8 @@ def train(players, envs, s, draws, orders, seeds, at_once=True, movers=None):
     """Yields the players after every update; ``envs[m]`` is the list that move m acts in.
 
     Move m is that of player ``movers[m]``, or of player m. ``seeds[m]`` are those of the first
-    resets; ``draws`` and ``orders`` are the generators of actions and of the minibatches. The network is called for what all environments show
-    ``at_once``, or for each of them alone.
+    resets; ``draws`` and ``orders`` are the generators of actions and of the minibatches. The
+    network is called for what all environments show ``at_once``, or for each of them alone.
     """
     like = next(players[0].parameters())
     optimizers = [torch.optim.Adam(player.parameters(), s.learning_rate) for player in players]

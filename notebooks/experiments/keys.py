@@ -127,6 +127,10 @@ SETTINGS = {
     "ppo_normalized": "PPO, advantages normalised",
     "ipo_normalized": "IPO, advantages normalised",
 }
+TURNS = {
+    "in_turn": "one network, one domain at a time",
+    "in_turn_lr1e-3": "one network, one domain at a time, PPO's learning rate",
+}
 LARGER = {
     "ppo": "PPO, 122,880 frames",
     "ipo": "IPO, 122,880 frames",
@@ -144,6 +148,15 @@ def main_arms(num_updates: int) -> list[Cell]:
         of("ppo_lr5e-4", "ppo", learning_rate=5e-4),
         of("ipo_lr1e-3", "ipo", learning_rate=1e-3),
         of("ensemble", "ensemble", learning_rate=5e-4),
+    ]
+
+
+def turn_arms(num_updates: int) -> list[Cell]:
+    """IPO without players and their average: one network, on one domain at a time."""
+    of = partial(arm, num_updates=num_updates)
+    return [
+        of("in_turn", "in_turn", learning_rate=5e-4),
+        of("in_turn_lr1e-3", "in_turn", learning_rate=1e-3),
     ]
 
 
@@ -382,7 +395,7 @@ def short(cell: Cell) -> Cell | None:
 
 EXPERIMENTS = {
     name: Experiment(run_cell, Cell, short, runs_at_once=25)
-    for name in ("main", "variants", "larger")
+    for name in ("main", "turns", "variants", "larger")
 } | {
     "curves": Experiment(run_curve, Cell, short, runs_at_once=25),
     "grids": Experiment(run_grid, Grid, lambda grid: grid if grid.size == 5 else None, (0,)),
