@@ -75,11 +75,9 @@ def recovered(rows: pd.DataFrame) -> pd.DataFrame:
 
 def differences(rows: pd.DataFrame, method: str, baseline: str) -> pd.DataFrame:
     """Paired by run, per configuration: mean and 95 % interval by Student's t."""
-    parts = {
-        size: paired_difference(own[method], own[baseline])
-        for size, own in _by_arm(rows).groupby(level=["num_domains", "dim_distractor"])
-    }
-    return pd.DataFrame(parts, index=["mean", "low", "high"]).T
+    groups = _by_arm(rows).groupby(level=["num_domains", "dim_distractor"])
+    found = {size: paired_difference(own[method], own[baseline]) for size, own in groups}
+    return pd.DataFrame(found.values(), index=list(found))
 
 
 def _by_arm(rows: pd.DataFrame) -> pd.DataFrame:

@@ -199,10 +199,13 @@ def rows_of_lqr() -> Iterator[Row]:
     yield row(lqr_learners.train, training, **refused, checkpoints=late)
     values = bad("sample size", [], [1.0]) + bad("not finite", [1.0, NAN], [1.0, INF])
     values += bad("shape", [[1.0, 2.0]], [[1.0], [2.0]]) + bad("kind of object", "ab", ["a", "b"])
-    two = {"values": [1.0, 2.0], "baseline": [2.0, 3.0], "rng": np.random.default_rng(0)}
-    yield row(stats.bootstrap_interval, two, values=values)
+    two = {"values": [1.0, 2.0], "baseline": [2.0, 3.0]}
+    yield row(stats.mean_interval, two, values=values)
     unpaired = values + bad("shape", [1.0, 2.0, 3.0])
     yield row(stats.paired_difference, two, values=values, baseline=unpaired)
+    yield row(
+        stats.power, {"effect": 1.0, "spread": 2.0, "num_runs": 10}, effect=NUMBER, spread=POSITIVE
+    )
     improvement = {"costs": [1.0, 2.0], "baseline": [1.0, 2.0]}
     yield row(stats.probability_of_improvement, improvement, costs=values, baseline=values)
 
@@ -676,6 +679,7 @@ TRUSTING = {
     r"ipo\.ppo\.(minibatches|clipped_loss|standardize|clip_gradients)": LOOP,
     r"ipo\.(ppo|rollouts)\.\w+\.restore": STATE,
     r"ipo\.rollouts\.(Step|Rollout)": RECORD,
+    r"ipo\.(stats\.Difference|game\.Move)": RECORD,
     r"ipo\.rollouts\.(\w+\.step|\w+\.__call__|Collector\.collect)": LOOP,
     r"ipo\.rollouts\.(value_errors|advantages)": LOOP,
     r"ipo\.causality\.icp\.ICPResult": RECORD,
