@@ -73,11 +73,16 @@ def recovered(rows: pd.DataFrame) -> pd.DataFrame:
     return gained.div(gained["ipo_fixed_phi"], axis=0)[list(ARMS)]
 
 
-def differences(rows: pd.DataFrame, method: str, baseline: str) -> pd.DataFrame:
-    """Paired by run, per configuration: mean and 95 % interval by Student's t."""
-    groups = _by_arm(rows).groupby(level=["num_domains", "dim_distractor"])
-    found = {size: paired_difference(own[method], own[baseline]) for size, own in groups}
-    return pd.DataFrame(found.values(), index=list(found))
+def shares_table(rows: pd.DataFrame) -> pd.DataFrame:
+    """:func:`recovered`, and how much more one domain at a time costs than IPO, paired by run."""
+    shares = recovered(rows).drop(columns=["gradient_descent", "ipo_fixed_phi"])
+    table = shares.round(2).rename(columns=ARMS)
+    table["one domain at a time − IPO, cost"] = [
+        f"{found.mean:+.1f} [{found.low:+.1f}, {found.high:+.1f}]"
+        for _, own in _by_arm(rows).groupby(level=["num_domains", "dim_distractor"])
+        for found in [paired_difference(own["in_turn"], own["ipo_fixed_phi"])]
+    ]
+    return table.rename_axis(index=["domains", "distractors"], columns=None).reset_index()
 
 
 def _by_arm(rows: pd.DataFrame) -> pd.DataFrame:
