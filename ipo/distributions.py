@@ -38,6 +38,12 @@ class Distribution(Protocol):
     def entropy(parameters: Tensor) -> Tensor:
         """H(pi( . | o)) in nats, ``[...]``."""
 
+    @staticmethod
+    def gradient(
+        parameters: Tensor, actions: Tensor, weights: Tensor, entropy_weight: float
+    ) -> Tensor:
+        """Of ``weights [...] log pi(a | o) + entropy_weight H`` in the parameters."""
+
 
 class Categorical:
     """A of a finite set; the parameters are its logits ``[..., A]``, an action is a number."""
@@ -60,6 +66,18 @@ class Categorical:
     def entropy(parameters: Tensor) -> Tensor:
         log_probabilities = _log_softmax(parameters)
         return -(log_probabilities.exp() * log_probabilities).sum(-1)
+
+    @staticmethod
+    def gradient(
+        parameters: Tensor, actions: Tensor, weights: Tensor, entropy_weight: float
+    ) -> Tensor:
+        """d log pi(a) / d z_i = 1(i = a) - pi(i),   d H / d z_i = - pi(i) (log pi(i) + H)."""
+        log_probabilities = _log_softmax(parameters)
+        probabilities = log_probabilities.exp()
+        weights = weights.unsqueeze(-1)
+        entropy = -(probabilities * log_probabilities).sum(-1, keepdim=True)
+        gradient = -probabilities * (weights + entropy_weight * (log_probabilities + entropy))
+        return gradient.scatter_add_(-1, actions.unsqueeze(-1), weights)
 
 
 class Gaussian:
@@ -92,6 +110,17 @@ class Gaussian:
     def entropy(parameters: Tensor) -> Tensor:
         deviation = parameters.chunk(2, -1)[1]
         return (0.5 + deviation.log() + LOG_SQRT_TAU).sum(-1)
+
+    @staticmethod
+    def gradient(
+        parameters: Tensor, actions: Tensor, weights: Tensor, entropy_weight: float
+    ) -> Tensor:
+        """With z = (a - m) / s: d log pi / d m = z / s, d log pi / d s = (z^2 - 1) / s, dH/ds = 1/s."""
+        mean, deviation = parameters.chunk(2, -1)
+        standard = (actions - mean) / deviation
+        weights = weights.unsqueeze(-1)
+        of_deviation = weights * (standard.square() - 1) + entropy_weight
+        return torch.cat([weights * standard, of_deviation], -1) / torch.cat([deviation] * 2, -1)
 
 
 def _log_softmax(logits: Tensor) -> Tensor:

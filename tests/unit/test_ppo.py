@@ -26,7 +26,7 @@ from ipo.ppo import (
     METHODS,
     PPOSettings,
     Training,
-    clip_gradients,
+    clip_gradient,
     clipped_loss,
     minibatches,
 )
@@ -592,7 +592,11 @@ def test_gradient_is_zero_where_the_ratio_is_clipped():
 def test_gradients_are_clipped_run_by_run(max_norm):
     rng = np.random.default_rng(0)
     gradients = [torch.tensor(rng.normal(size=(3, *shape))) for shape in ((4, 5), (5,), (2, 1, 2))]
-    clipped = clip_gradients(gradients, max_norm)
+    in_rows = clip_gradient(torch.cat([g.flatten(1) for g in gradients], 1), max_norm)
+    clipped = [
+        part.reshape(own.shape)
+        for part, own in zip(in_rows.split([20, 5, 4], 1), gradients, strict=True)
+    ]
     for run in range(3):
         leaves = [torch.zeros(g.shape[1:], dtype=g.dtype, requires_grad=True) for g in gradients]
         for leaf, gradient in zip(leaves, gradients, strict=True):
@@ -603,8 +607,7 @@ def test_gradients_are_clipped_run_by_run(max_norm):
 
 
 def test_no_gradient_stays_no_gradient():
-    (clipped,) = clip_gradients([torch.zeros(2, 3)], 0.5)
-    assert clipped.tolist() == [[0, 0, 0]] * 2
+    assert clip_gradient(torch.zeros(2, 3), 0.5).tolist() == [[0, 0, 0]] * 2
 
 
 # -------------------------------------------------------------------------- minibatches
@@ -623,7 +626,8 @@ def test_minibatches_are_a_partition(seed, num_copies, num_steps, skip, data):
     settings = PPOSettings("ppo", num_steps=num_steps, minibatch_size=size)
     frames = random_frames(num_runs=3, num_copies=num_copies, num_steps=num_steps).frames()
     generators = [np.random.default_rng([seed, run]) for run in range(3)]
-    batches = list(minibatches(frames, settings, generators, skip))
+    numbers = torch.arange(num_frames).expand(3, -1)
+    batches = [x for _, (x,) in minibatches(frames, [numbers], settings, generators, skip)]
     expected = {n * num_steps + t for n in range(num_copies) for t in range(num_steps - skip)}
     assert all(batch.shape == (3, size) for batch in batches[:-1])
     for run in range(3):
@@ -634,10 +638,16 @@ def test_minibatches_are_a_partition(seed, num_copies, num_steps, skip, data):
 def test_runs_have_orders_of_their_own():
     settings = PPOSettings("ppo", num_steps=10, minibatch_size=40)
     frames = random_frames(num_steps=10).frames()
-    (order,) = minibatches(frames, settings, [np.random.default_rng(r) for r in range(2)], False)
-    assert not torch.equal(order[0], order[1])
-    (alone,) = minibatches(frames, settings, [np.random.default_rng(1)], False)
-    assert torch.equal(order[1], alone[0])
+    numbers = torch.arange(40).expand(2, -1)
+
+    def order(*seeds: int) -> Tensor:
+        generators = [np.random.default_rng(seed) for seed in seeds]
+        ((_, (chosen,)),) = minibatches(frames, [numbers], settings, generators, False)
+        return chosen
+
+    together = order(0, 1)
+    assert not torch.equal(together[0], together[1])
+    assert torch.equal(together[1], order(1, 1)[0])
 
 
 @pytest.mark.parametrize("num_epochs", [1, 2, 3, 4])
@@ -666,7 +676,7 @@ def test_every_second_epoch_leaves_out_the_last_frames(num_epochs):
 
     norms: list[float] = []
     training = in_training(settings)
-    training.optimizers[0] = Watched(list(training.players[0].values()), 1e-9)
+    training.optimizers[0] = Watched([training.rows[0]], 1e-9)
     training.improve(0, rollout.frames())
     assert [norm > 0 for norm in norms] == [True, False, True, False][:num_epochs]
 
