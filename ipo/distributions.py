@@ -93,8 +93,8 @@ class Gaussian:
     @staticmethod
     def sample(parameters: Tensor, generators: Generators) -> Tensor:
         mean, deviation = parameters.chunk(2, -1)
-        noise = [generator.standard_normal(mean.shape[1:]) for generator in generators]
-        return mean + deviation * torch.tensor(np.stack(noise)).to(mean)
+        noise = np.array([generator.standard_normal(mean.shape[1:]) for generator in generators])
+        return mean + deviation * torch.from_numpy(noise).to(mean)
 
     @staticmethod
     def mode(parameters: Tensor) -> Tensor:
@@ -115,7 +115,7 @@ class Gaussian:
     def gradient(
         parameters: Tensor, actions: Tensor, weights: Tensor, entropy_weight: float
     ) -> Tensor:
-        """With z = (a - m) / s: d log pi / d m = z / s, d log pi / d s = (z^2 - 1) / s, dH/ds = 1/s."""
+        """With z = (a - m) / s: dlog pi/dm = z / s,  dlog pi/ds = (z^2 - 1) / s,  dH/ds = 1 / s."""
         mean, deviation = parameters.chunk(2, -1)
         standard = (actions - mean) / deviation
         weights = weights.unsqueeze(-1)

@@ -201,7 +201,8 @@ class DenseNetwork(Network):
             deviation = np.mean([own["log_std"].exp().numpy() for own in players], 0)
 
         def outputs(parts: list[Layers], x: np.ndarray) -> np.ndarray:
-            return sum(inputs_and_output(own, x)[-1] for own in parts) / len(parts)
+            each = [inputs_and_output(own, x)[-1] for own in parts]
+            return np.sum(each, 0) / len(each)
 
         def policy(observations: Tensor) -> Outputs:
             x = observations.numpy()

@@ -20,7 +20,7 @@ from small import DoubleNetwork, assert_close, plain_network
 from torch import Tensor
 
 from experiments.keys import published
-from ipo.distributions import Categorical
+from ipo.distributions import Categorical, Gaussian
 from ipo.networks import GridNetwork, OnTable, Weights, copied
 from ipo.ppo import (
     METHODS,
@@ -28,6 +28,7 @@ from ipo.ppo import (
     Training,
     clip_gradient,
     clipped_loss,
+    loss_gradient,
     minibatches,
 )
 from ipo.rollouts import (
@@ -578,14 +579,43 @@ def test_clipped_error_of_the_value_by_hand(value, expected):
 
 def test_gradient_is_zero_where_the_ratio_is_clipped():
     batch = random_frames(num_copies=1, num_steps=5).frames()
-    logits = torch.zeros(2, 5, 7, dtype=torch.float64, requires_grad=True)
+    logits = torch.zeros(2, 5, 7, dtype=torch.float64)
     batch = batch._replace(
         log_probabilities=torch.full((2, 5), math.log(1 / 7 / 1.5)).double(),
         advantages=batch.advantages.abs(),
     )
     settings = PPOSettings("ppo", entropy_weight=0.0, value_weight=0.0)
-    clipped_loss(Categorical, logits, batch.values, batch, settings).sum().backward()
-    assert not logits.grad.any()
+    slopes = loss_gradient(Categorical, logits, batch.values, batch, settings)
+    assert not any(slope.any() for slope in slopes)
+
+
+@pytest.mark.parametrize("distribution", [Categorical, Gaussian])
+@pytest.mark.parametrize("dtype, rtol", [(torch.float64, 1e-12), (torch.float32, 1e-5)])
+@pytest.mark.parametrize("normalize", ["none", "minibatch"])
+def test_gradient_of_the_loss_is_that_of_torch(distribution, dtype, rtol, normalize):
+    """On frames of which many are clipped, in the ratio, in the value, in both and in neither."""
+    generator = torch.Generator().manual_seed(0)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(2, 400, *shape, generator=generator, dtype=dtype)
+
+    parameters, values = normal(6), normal()
+    actions = normal(3)
+    if distribution is Categorical:
+        actions = actions.abs().argmax(-1)
+    else:
+        parameters[..., 3:].exp_()
+    old = distribution.log_probability(parameters, actions) + 0.3 * normal()
+    batch = Rollout(values, actions, old, values + 0.3 * normal(), normal(), normal())
+    settings = PPOSettings("ppo", normalize_advantages=normalize)
+    leaves = [x.clone().requires_grad_() for x in (parameters, values)]
+    loss = clipped_loss(distribution, *leaves, batch, settings)
+    expected = torch.autograd.grad(loss.sum(), leaves)
+    found = loss_gradient(distribution, parameters, values, batch, settings)
+    for ours, theirs in zip(found, expected, strict=True):
+        constant = ours == 0  # where the entropy has no say: in the values
+        assert_close(ours, theirs, rtol)
+    assert 0.1 < constant.double().mean() < 0.9
 
 
 @pytest.mark.parametrize("max_norm", [0.1, 0.5, 1000.0])
