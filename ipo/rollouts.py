@@ -90,9 +90,8 @@ class FromGymnasium:
 
     def _by_run(self, values: np.ndarray) -> Tensor:
         """A copy ``[R, N, ...]``, in single precision where they are numbers."""
-        dtype = torch.bool if values.dtype == bool else torch.float32
-        copy = torch.from_numpy(values).to(dtype, copy=True)
-        return copy.view(self.num_runs, -1, *values.shape[1:])
+        copy = values.astype(bool if values.dtype == bool else np.float32)
+        return torch.from_numpy(copy.reshape(self.num_runs, -1, *values.shape[1:]))
 
 
 class RewardNormalizer:
