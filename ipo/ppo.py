@@ -152,6 +152,7 @@ class Training:
 
     Attributes:
         players: weights of every player; they change in place.
+        rows: the same memory as one ``[R, P]`` for each player, which the optimisers move.
         collectors: every player's environments.
         num_frames: seen so far, in each run.
 
@@ -278,6 +279,15 @@ class Training:
         }
 
     def restore(self, state: dict[str, Any]) -> None:
+        """Go on from ``state()``.
+
+        Raises:
+            ValueError: a state of other weights, or of a version that kept moments for each weight.
+        """
+        for row, moments in zip(self.rows, state["optimizers"], strict=True):
+            shapes = [tuple(own["exp_avg"].shape) for own in moments]
+            if shapes not in ([], [row.shape]):  # the fused Adam would read beyond their ends
+                raise ValueError(f"state: has moments of shapes {shapes}, must be {[row.shape]}")
         self.num_frames = state["num_frames"]
         self.set_players(state["players"])
         for optimizer, moments in zip(self.optimizers, state["optimizers"], strict=True):
