@@ -161,12 +161,12 @@ CLEAN_UPS = {
     ),
     "a loop for a comprehension": (
         "ipo/ppo.py",
-        r"    return \[g \* (scale.reshape.*) for g in gradients\]\n",
-        "    scaled = []\n"
-        "    for g in gradients:\n"
-        r"        scaled.append(g * \1)"
+        r"    columns = \[(chosen_rows.*) for x in (.*)\]\n",
+        "    columns = []\n"
+        r"    for x in \2:"
         "\n"
-        "    return scaled\n",
+        r"        columns.append(\1)"
+        "\n",
         "keys/curves",
     ),
     "an argument by name": (

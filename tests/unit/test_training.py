@@ -198,6 +198,18 @@ def test_a_restored_training_goes_on_as_if_nothing_had_happened(method):
     assert not torch.equal(flat(first), flat(whole))
 
 
+def test_moments_of_each_weight_as_they_once_were_are_refused():
+    training = trainings(PPOSettings("ppo", **SMALL))
+    training.update()
+    state = training.state()
+    zeros = [torch.zeros_like(w) for w in training.players[0].values()]
+    state["optimizers"][0] = [
+        {"step": torch.tensor(1.0), "exp_avg": zero, "exp_avg_sq": zero} for zero in zeros
+    ]
+    with pytest.raises(ValueError, match="moments of shapes"):
+        training.restore(state)
+
+
 @pytest.mark.parametrize("d", [0, 1])
 def test_a_player_who_goes_on_alone_collects_and_learns_alone(d):
     settings = PPOSettings("ipo", **(SMALL | {"num_steps": 18}))
