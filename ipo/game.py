@@ -119,6 +119,7 @@ class LinearPlayers:
             for start in starts.detach().unbind(1)
         ]
         self.policy = average(self.weights)
+        self._seen = self.policy.clone().requires_grad_()  # what a player differentiates
         self.optimizers = [optimizer([player]) for player in self.players]
         self.bound, self.max_gradient_norm, self.order = bound, max_gradient_norm, order
 
@@ -141,24 +142,29 @@ class LinearPlayers:
 
     def _move_in_turn(self, d: int, cost: Cost) -> None:
         """Player d steps; the average holds its new weights before the next player moves."""
-        player, share = self.players[d], 1 / len(self.players)
-        # In place, because it is large: what is left is the others' part.
-        self.policy.sub_(player.detach(), alpha=share)
-        self._step(d, lambda: cost(self.policy.add(player, alpha=share)))
-        self.policy.add_(player.detach(), alpha=share)
+        player, share = self.players[d].detach(), 1 / len(self.players)
+        self.policy.sub_(player, alpha=share)  # in place, because it is large: the others' part
+        self._step(d, cost, self.policy)
+        self.policy.add_(player, alpha=share)
 
     def _move_together(self, d: int, cost: Cost) -> None:
         """Player d steps; the average changes when the last has moved."""
-        player, share = self.players[d], 1 / len(self.players)
-        others = self.policy - share * player.detach()
-        self._step(d, lambda: cost(others + share * player))
+        player, share = self.players[d].detach(), 1 / len(self.players)
+        self._step(d, cost, self.policy - share * player)
         if d == len(self.players) - 1:
             self.policy.copy_(average(self.weights))
 
-    def _step(self, d: int, objective: Callable[[], Tensor]) -> None:
-        descend(self.optimizers[d], objective, self.max_gradient_norm)
+    def _step(self, d: int, cost: Cost, others: Tensor) -> None:
+        player, share = self.players[d].detach(), 1 / len(self.players)
+
+        def objective() -> Tensor:
+            with torch.no_grad():
+                torch.add(others, player, alpha=share, out=self._seen)
+            return cost(self._seen)
+
+        descend(self.optimizers[d], objective, self.max_gradient_norm, self._seen, share)
         if self.bound is not None:
-            self.players[d].detach().clamp_(-self.bound, self.bound)
+            player.clamp_(-self.bound, self.bound)
 
 
 @checked
