@@ -1,4 +1,4 @@
-"""The game behind IPO: who owns which domains, one round of Algorithm 1, and the Nash gap.
+"""The game behind IPO: who moves on which domains, one round of Algorithm 1, and the Nash gap.
 
 Every player owns some training domains. The players' policies are averaged, and the average acts
 in all domains. In a round each player in turn changes its own weights so that the cost of *its*
@@ -7,6 +7,7 @@ domains falls, while the others stand still. All methods of the book are this ga
     pooled training (gradient descent, PPO)     one player that owns all domains
     IPO, IRM-Games                              a player for each domain
     ensemble                                    as many players, each of which owns all domains
+    one domain at a time                        one player, who moves on each domain in turn
 
 Players are linear controllers and predictors (:class:`LinearPlayers`, here) or networks
 (``ipo.ppo``); they all play :func:`play_round`.
@@ -17,7 +18,7 @@ Source: Algorithm 1 of Sonar, Pacelli and Majumdar (2021), after Ahuja et al. (2
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import torch
 from torch import Tensor
@@ -25,7 +26,7 @@ from torch import Tensor
 from ipo.checks import Count, Positive, check_count, checked, one_of
 from ipo.optimizers import descend
 
-OWNERSHIPS = ("pooled", "ipo", "ensemble")
+GAMES = ("pooled", "ipo", "ensemble", "in_turn")
 ORDERS = ("in_turn", "together")
 Order = Annotated[str, one_of(ORDERS)]
 
@@ -33,25 +34,32 @@ Cost = Callable[[Tensor], Tensor]  # policy [R, ...] -> [R]
 BestCosts = Annotated[Tensor, "R E"] | Annotated[Tensor, "R 1"]
 
 
-@checked
-def domains_of_players(
-    method: Annotated[str, one_of(OWNERSHIPS)], num_domains: Count
-) -> list[list[int]]:
-    """The domains that each player owns.
+class Move(NamedTuple):
+    """Who moves, and the domains whose cost is to fall."""
 
-    ``pooled`` is one player that owns all; in ``ipo`` each domain has a player of its own; an
-    ``ensemble`` has as many players as ``ipo``, and each owns all domains.
+    player: int
+    domains: list[int]
+
+
+@checked
+def moves(method: Annotated[str, one_of(GAMES)], num_domains: Count) -> list[Move]:
+    """The moves of a round.
+
+    ``pooled`` is one player that owns all domains; in ``ipo`` each domain has a player of its own;
+    an ``ensemble`` has as many players as ``ipo``, and each owns all domains. ``in_turn`` is a
+    control between them: one player that visits the domains as IPO's players do.
     """
     everything = list(range(num_domains))
     return {
-        "pooled": [everything],
-        "ipo": [[d] for d in everything],
-        "ensemble": [everything] * num_domains,
+        "pooled": [Move(0, everything)],
+        "ipo": [Move(d, [d]) for d in everything],
+        "ensemble": [Move(d, everything) for d in everything],
+        "in_turn": [Move(0, [d]) for d in everything],
     }[method]
 
 
 def play_round(
-    num_players: int,
+    num_moves: int,
     respond: Callable[[int], None],
     num_inner_rounds: int = 1,
     move_phi: Callable[[], None] | None = None,
@@ -59,18 +67,18 @@ def play_round(
     """One iteration of Algorithm 1, whatever the players are made of.
 
     Args:
-        num_players: E.
-        respond: ``respond(d)`` makes player d's move while the others stand still.
+        num_moves: one for each player, who own the domains; see :func:`moves`.
+        respond: ``respond(d)`` makes move d, while all other players stand still.
         num_inner_rounds: K; it is 1 in all runs of the paper.
         move_phi: lets the part that all players share make its move on the cost of all domains;
             ``None``: Phi is fixed.
     """
-    check_count("num_players", num_players)
+    check_count("num_moves", num_moves)
     check_count("num_inner_rounds", num_inner_rounds)
     if move_phi is not None:  # lines 2 to 6
         move_phi()
     for _ in range(num_inner_rounds):  # line 7
-        for d in range(num_players):  # line 8
+        for d in range(num_moves):  # line 8
             respond(d)  # lines 9 and 10: what the next player sees is the new average
 
 
@@ -119,7 +127,6 @@ class LinearPlayers:
             for start in starts.detach().unbind(1)
         ]
         self.policy = average(self.weights)
-        self._seen = self.policy.clone().requires_grad_()  # what a player differentiates
         self.optimizers = [optimizer([player]) for player in self.players]
         self.bound, self.max_gradient_norm, self.order = bound, max_gradient_norm, order
 
@@ -142,29 +149,24 @@ class LinearPlayers:
 
     def _move_in_turn(self, d: int, cost: Cost) -> None:
         """Player d steps; the average holds its new weights before the next player moves."""
-        player, share = self.players[d].detach(), 1 / len(self.players)
-        self.policy.sub_(player, alpha=share)  # in place, because it is large: the others' part
-        self._step(d, cost, self.policy)
-        self.policy.add_(player, alpha=share)
+        player, share = self.players[d], 1 / len(self.players)
+        # In place, because it is large: what is left is the others' part.
+        self.policy.sub_(player.detach(), alpha=share)
+        self._step(d, lambda: cost(self.policy.add(player, alpha=share)))
+        self.policy.add_(player.detach(), alpha=share)
 
     def _move_together(self, d: int, cost: Cost) -> None:
         """Player d steps; the average changes when the last has moved."""
-        player, share = self.players[d].detach(), 1 / len(self.players)
-        self._step(d, cost, self.policy - share * player)
+        player, share = self.players[d], 1 / len(self.players)
+        others = self.policy - share * player.detach()
+        self._step(d, lambda: cost(others + share * player))
         if d == len(self.players) - 1:
             self.policy.copy_(average(self.weights))
 
-    def _step(self, d: int, cost: Cost, others: Tensor) -> None:
-        player, share = self.players[d].detach(), 1 / len(self.players)
-
-        def objective() -> Tensor:
-            with torch.no_grad():
-                torch.add(others, player, alpha=share, out=self._seen)
-            return cost(self._seen)
-
-        descend(self.optimizers[d], objective, self.max_gradient_norm, self._seen, share)
+    def _step(self, d: int, objective: Callable[[], Tensor]) -> None:
+        descend(self.optimizers[d], objective, self.max_gradient_norm)
         if self.bound is not None:
-            player.clamp_(-self.bound, self.bound)
+            self.players[d].detach().clamp_(-self.bound, self.bound)
 
 
 @checked

@@ -45,31 +45,24 @@ def descend(
     optimizer: torch.optim.Optimizer,
     objective: Callable[[], Tensor],
     max_gradient_norm: float | None = None,
-    seen: Tensor | None = None,
-    share: float = 1.0,
 ) -> None:
     """One step down ``objective() -> [runs]``, for all runs at once.
 
     Only the optimiser's own leaves are differentiated, so nobody else moves and no time is
     spent on gradients that are not used. ``max_gradient_norm`` bounds the norm of each
-    leaf's gradient, run by run. Where the objective is a function of ``seen``, and its slope in
-    the only leaf is ``share`` times the one in ``seen``, that is what is differentiated.
+    leaf's gradient, run by run.
     """
     leaves = [leaf for group in optimizer.param_groups for leaf in group["params"]]
 
-    def closure() -> Tensor:
+    def closure() -> float:
         costs = objective()
         # The runs do not interact: the gradient of their sum holds the gradient of each.
-        gradients = torch.autograd.grad(
-            costs, leaves if seen is None else seen, torch.full_like(costs, share)
-        )
+        gradients = torch.autograd.grad(costs.sum(), leaves)
         for leaf, gradient in zip(leaves, gradients, strict=True):
             leaf.grad = _clip(gradient, max_gradient_norm)
-        return costs.detach().sum()
+        return float(costs.detach().sum())
 
     optimizer.step(closure)
-    for leaf in leaves:
-        leaf.grad = None  # the next gradient takes its memory, which is still in the cache
 
 
 def _clip(gradient: Tensor, max_norm: float | None) -> Tensor:
