@@ -187,8 +187,8 @@ def feedback_costs(F: Tensor, problem: LQR) -> Tensor:
     """The cost of ``a = -F s``, F ``[R, n_u, n_x]`` or ``[R, E, n_u, n_x]``; unchecked."""
     systems = [problem.A, problem.B, problem.Q, problem.R]
     if F.dim() == 4:
-        systems = [matrix.unsqueeze(1) for matrix in systems]
-    return _StateFeedbackCost.apply(F, *systems)
+        systems = [matrix.repeat_interleave(F.shape[1], dim=0) for matrix in systems]
+    return _StateFeedbackCost.apply(F.flatten(0, -3), *systems).unflatten(0, F.shape[:-2])
 
 
 class _StateFeedbackCost(torch.autograd.Function):
@@ -201,21 +201,19 @@ class _StateFeedbackCost(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, F: Tensor, A: Tensor, B: Tensor, Q: Tensor, R: Tensor) -> Tensor:
-        M = A - B @ F
-        RF = R @ F
-        P, S, stable = _lyapunov_pair(M, Q + F.mT @ RF)
-        ctx.save_for_backward(RF - B.mT @ (P @ M), S, stable)
-        cost = P.diagonal(dim1=-2, dim2=-1).sum(-1)
-        return torch.where(stable, cost, math.inf)
+        M = torch.baddbmm(A, B, F, alpha=-1)
+        RF = torch.bmm(R, F)
+        P, S = _lyapunov_pair(M, torch.baddbmm(Q, F.mT, RF))
+        ctx.save_for_backward(torch.baddbmm(RF, B.mT, torch.bmm(P, M), alpha=-1), S)
+        return P.diagonal(dim1=-2, dim2=-1).sum(-1)
 
     @staticmethod
     def backward(ctx: Any, grad_cost: Tensor) -> tuple[Tensor, None, None, None, None]:
-        slope, S, stable = ctx.saved_tensors
-        scale = torch.where(stable, 2 * grad_cost, math.nan)  # an infinite cost has no gradient
-        return scale[..., None, None] * (slope @ S), None, None, None, None
+        slope, S = ctx.saved_tensors
+        return torch.bmm(slope * (2 * grad_cost)[:, None, None], S), None, None, None, None
 
 
-def _lyapunov_pair(M: Tensor, C: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _lyapunov_pair(M: Tensor, C: Tensor) -> tuple[Tensor, Tensor]:
     """Solve ``P = C + M'P M`` and ``S = I + M S M'`` together by doubling.
 
     After k doublings ``X`` holds the first 2^k terms of both series and ``Y`` is M^(2^k):
@@ -225,23 +223,21 @@ def _lyapunov_pair(M: Tensor, C: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     Stops when the next terms are below rounding, which takes 4 to 10 doublings.
 
     Returns:
-        P, S ``[..., n, n]`` and ``stable [...]``, false where the series does not end.
+        P, S ``[..., n, n]``. Where the series do not end, P is infinite and S is NaN: the cost
+        is infinite and has no gradient.
     """
-    shape, n = M.shape, M.shape[-1]
-    M = M.reshape(-1, n, n)
-    C = C.reshape(-1, n, n)
-    X = torch.cat([C, torch.eye(n, dtype=M.dtype).expand_as(C)])
+    X = torch.cat([C, torch.eye(M.shape[-1], dtype=M.dtype).expand_as(C)])
     Y = torch.cat([M, M.mT])  # the second equation is the first one of M'
-    negligible = math.sqrt(torch.finfo(M.dtype).eps) / 4
+    negligible = math.sqrt(torch.finfo(M.dtype).eps)
     for _ in range(MAX_DOUBLINGS):
         X = torch.baddbmm(X, torch.bmm(Y.mT, X), Y)
         Y = torch.bmm(Y, Y)
-        size = torch.linalg.vector_norm(Y[: len(M)], dim=(-2, -1))
-        if bool(size.max() < negligible):
-            break
-    stable = (size < negligible).reshape(shape[:-2])
-    P, S = X.reshape(2, *shape)
-    return P, S, stable
+        if float(torch.linalg.vector_norm(Y)) < negligible:  # of all systems together
+            return X.chunk(2)
+    P, S = X.chunk(2)
+    endless = ~(torch.linalg.vector_norm(Y[: len(M)], dim=(-2, -1)) < negligible)
+    P[endless], S[endless] = math.inf, math.nan
+    return P, S
 
 
 @checked

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -132,16 +132,19 @@ def ipo_variable_phi(
     Phi, K = _random_layers(problem, settings, seeds)
     players = _players(settings, K, problem.num_domains)
     optimizer = _optimizer(settings, [Phi])
-    features: list[Tensor] = []  # Phi W_d, [R, n_h, n_x] for each domain
+    known: list[Tensor] = []  # Phi [W_1 ... W_E], [R, n_h, E n_x], until Phi moves
+    features: list[Tensor] = []  # the same, for each domain
+
+    def pooled_cost() -> Tensor:
+        # L-BFGS asks for several Phi in a step: only the first one's features are known.
+        seen = known.pop() if known else Phi.detach() @ problem.seen
+        F = _FeedbackBehindPhi.apply(Phi, players.policy, problem.seen, seen)
+        return feedback_costs(split_domains(F, problem.num_domains), problem).mean(1)
 
     def move_phi() -> None:
-        descend(
-            optimizer,
-            lambda: _pooled_cost(players.policy @ Phi, problem),
-            settings.max_gradient_norm,
-        )
-        seen = split_domains(Phi.detach() @ problem.seen, problem.num_domains)
-        features[:] = seen.unbind(1)
+        descend(optimizer, pooled_cost, settings.max_gradient_norm)
+        known[:] = [Phi.detach() @ problem.seen]
+        features[:] = split_domains(known[0], problem.num_domains).unbind(1)
 
     costs = [
         lambda K, d=d: feedback_costs(K @ features[d], problem) for d in range(problem.num_domains)
@@ -150,6 +153,23 @@ def ipo_variable_phi(
         iterate=lambda: players.round(costs, move_phi=move_phi),
         gain=lambda: players.policy @ Phi.detach(),
     )
+
+
+class _FeedbackBehindPhi(torch.autograd.Function):
+    """``F = K (Phi W)`` as a function of Phi, where ``Phi W`` is known from the last round.
+
+    Backwards ``dPhi = K' (dF W')``, the products in the order that costs least.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, Phi: Tensor, K: Tensor, W: Tensor, features: Tensor) -> Tensor:
+        ctx.save_for_backward(K, W)
+        return torch.bmm(K, features)
+
+    @staticmethod
+    def backward(ctx: Any, grad_F: Tensor) -> tuple[Tensor, None, None, None]:
+        K, W = ctx.saved_tensors
+        return torch.bmm(K.mT, torch.bmm(grad_F, W.mT)), None, None, None
 
 
 @checked
