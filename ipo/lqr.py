@@ -233,7 +233,8 @@ def _lyapunov_pair(M: Tensor, C: Tensor) -> tuple[Tensor, Tensor]:
         X = torch.baddbmm(X, torch.bmm(Y.mT, X), Y)
         Y = torch.bmm(Y, Y)
         if float(torch.linalg.vector_norm(Y)) < negligible:  # of all systems together
-            return X.chunk(2)
+            P, S = X.chunk(2)
+            return P, S
     P, S = X.chunk(2)
     endless = ~(torch.linalg.vector_norm(Y[: len(M)], dim=(-2, -1)) < negligible)
     P[endless], S[endless] = math.inf, math.nan
