@@ -74,11 +74,12 @@ def check_choice(name: str, value: object, choices: Iterable[str]) -> None:
 
 
 def check_choices(name: str, values: object, choices: Sequence[str]) -> None:
-    """A list of some of ``choices``."""
+    """A list of some of ``choices``, each once."""
     if isinstance(values, str) or not isinstance(values, Sequence) or not values:
         raise ValueError(f"{name} = {values!r}: must be a list of some of {', '.join(choices)}")
     for index, value in enumerate(values):
         check_choice(f"{name}[{index}]", value, choices)
+    _check_different(name, values)
 
 
 def check_counts(name: str, values: object, minimum: int = 1, maximum: int | None = None) -> None:
@@ -89,6 +90,10 @@ def check_counts(name: str, values: object, minimum: int = 1, maximum: int | Non
         raise ValueError(f"{name} = {values!r}: must not be empty")
     for index, value in enumerate(values):
         check_count(f"{name}[{index}]", value, minimum, maximum)
+    _check_different(name, values)
+
+
+def _check_different(name: str, values: Sequence[object]) -> None:
     if len(set(values)) < len(values):
         raise ValueError(f"{name} = {values!r}: must not name a value twice")
 
