@@ -99,13 +99,14 @@ def _check_different(name: str, values: Sequence[object]) -> None:
 
 
 def check_numbers(name: str, values: object, length: int = 1, **bounds: float) -> None:
-    """A list of at least so many finite numbers within the bounds."""
+    """A list of at least so many different finite numbers within the bounds."""
     if isinstance(values, str | bytes) or not isinstance(values, Sequence):
         raise TypeError(f"{name} = {values!r}: must be a list of numbers")
     if len(values) < length:
         raise ValueError(f"{name} = {values!r}: must have at least {length} numbers")
     for index, value in enumerate(values):
         check_number(f"{name}[{index}]", value, **bounds)
+    _check_different(name, values)
 
 
 def check_checkpoints(checkpoints: Iterable[int], end: int) -> None:
