@@ -74,8 +74,10 @@ SMALLEST = {
         "num_distractors": 1,
     },
 }
-# What must go with it: on a grid of five cells, two of the larger arms are two of the main ones.
+# What must go with it: live problems are some of all, and on a grid of five cells two of the larger
+# arms are two of the main ones.
 COMPANIONS = {
+    ("algorithm", "num_problems"): {"num_live": 2},
     ("keys", "num_runs"): {"num_runs_larger": 2},
     ("keys", "num_runs_larger"): {"num_runs": 2},
 }
@@ -121,7 +123,8 @@ TOGETHER: dict[str, list[dict[str, Any]]] = {
         {"film_every": 1000},
     ],
     "algorithm": [
-        {"num_problems": 2, "num_live": 3, "num_rounds": 1},
+        SMALLEST["algorithm"],
+        {"num_problems": 2, "num_live": 3},
         {"num_problems": 501, "num_live": 4, "num_rounds": 1},
         {"num_updates": 3, "num_key_runs": 3, "num_rounds": 1},
     ],
