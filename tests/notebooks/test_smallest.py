@@ -50,7 +50,7 @@ SMALLEST = {
     "door": {
         "num_runs": 2,
         "num_updates": 2,
-        "num_steps": 1,
+        "num_steps": 512,  # an episode
         "num_doors": 2,  # as many as are watched
         "num_doors_watched": 1,
         "num_alone": 1,
