@@ -74,11 +74,12 @@ def check_choice(name: str, value: object, choices: Iterable[str]) -> None:
 
 
 def check_choices(name: str, values: object, choices: Sequence[str]) -> None:
-    """A list of some of ``choices``."""
+    """A list of some of ``choices``, each once."""
     if isinstance(values, str) or not isinstance(values, Sequence) or not values:
         raise ValueError(f"{name} = {values!r}: must be a list of some of {', '.join(choices)}")
     for index, value in enumerate(values):
         check_choice(f"{name}[{index}]", value, choices)
+    _check_different(name, values)
 
 
 def check_counts(name: str, values: object, minimum: int = 1, maximum: int | None = None) -> None:
@@ -89,18 +90,23 @@ def check_counts(name: str, values: object, minimum: int = 1, maximum: int | Non
         raise ValueError(f"{name} = {values!r}: must not be empty")
     for index, value in enumerate(values):
         check_count(f"{name}[{index}]", value, minimum, maximum)
+    _check_different(name, values)
+
+
+def _check_different(name: str, values: Sequence[object]) -> None:
     if len(set(values)) < len(values):
         raise ValueError(f"{name} = {values!r}: must not name a value twice")
 
 
 def check_numbers(name: str, values: object, length: int = 1, **bounds: float) -> None:
-    """A list of at least so many finite numbers within the bounds."""
+    """A list of at least so many different finite numbers within the bounds."""
     if isinstance(values, str | bytes) or not isinstance(values, Sequence):
         raise TypeError(f"{name} = {values!r}: must be a list of numbers")
     if len(values) < length:
         raise ValueError(f"{name} = {values!r}: must have at least {length} numbers")
     for index, value in enumerate(values):
         check_number(f"{name}[{index}]", value, **bounds)
+    _check_different(name, values)
 
 
 def check_checkpoints(checkpoints: Iterable[int], end: int) -> None:

@@ -505,7 +505,7 @@ def digit_numbers(
 
 
 def failure_numbers(failures: pd.DataFrame) -> dict[str, float]:
-    """Mean test errors at the first and the last level of each problem.
+    """Mean test errors at the lowest and the highest level of each problem.
 
     Also the level where IRMv1 is worst on small shifts, and ICP on marked domains, and what all
     methods come to there.
@@ -517,7 +517,7 @@ def failure_numbers(failures: pd.DataFrame) -> dict[str, float]:
         ("marked", "marked_domains", "icp"),
     ):
         rows = select(failures, {"problem": problem, "metric": "test_risk"})
-        levels = list(rows["level"].unique())
+        levels = sorted(rows["level"].unique())
         places = {"first": levels[0], "last": levels[-1]}
         if watched:
             errors = [mean_value(rows, method=watched, level=level) for level in levels]

@@ -22,7 +22,7 @@ from experiments.policies import check_place, load_policy, save_policy
 from experiments.rows import tidy
 from experiments.tables import mean_and_std
 from experiments.tabulated import load_or_tabulate
-from ipo.checks import Count, check_choice, checked, one_of
+from ipo.checks import Count, check_choice, check_choices, checked, one_of
 from ipo.distributions import Categorical
 from ipo.networks import GridNetwork, OnTable, Weights
 from ipo.ppo import PPOSettings, Training
@@ -39,6 +39,7 @@ from ipo.worlds.tabular import (
 )
 
 TRAINED, TESTED = ("red", "green"), "grey"
+INSIDE = ("red", "yellow")  # codes with all others but grey between them
 ENCODINGS = ("integer", "one_hot", "none")
 COLOR_CHANNEL = 1
 NUM_COPIES, NUM_EPISODES = 50, 100  # of the published evaluation
@@ -119,14 +120,6 @@ MAIN = {
     "ipo_lr1e-3": "IPO, PPO's learning rate",
     "ensemble": "ensemble, pooled data",
 }
-SETTINGS = {
-    "ppo": "PPO, as published",
-    "ipo": "IPO, as published",
-    "ppo_3colors": "PPO, red, green and blue",
-    "ipo_3colors": "IPO, red, green and blue",
-    "ppo_normalized": "PPO, advantages normalised",
-    "ipo_normalized": "IPO, advantages normalised",
-}
 TURNS = {
     "in_turn": "one network, one domain at a time",
     "in_turn_lr1e-3": "one network, one domain at a time, PPO's learning rate",
@@ -139,9 +132,20 @@ LARGER = {
 }
 
 
-def main_arms(num_updates: int) -> list[Cell]:
+def check_train_colors(train_colors: object) -> None:
+    """Two colours other than the test domain's.
+
+    The 48 copies of the environment are split evenly among the players and domains of an ensemble,
+    and once more among these colours and a third.
+    """
+    check_choices("train_colors", train_colors, [color for color in COLORS if color != TESTED])
+    if len(train_colors) != 2:
+        raise ValueError(f"train_colors = {train_colors!r}: must be two colours")
+
+
+def main_arms(num_updates: int, train_colors: Sequence[str] = TRAINED) -> list[Cell]:
     """PPO and IPO as published, each with the other's learning rate, and IPO without the game."""
-    of = partial(arm, num_updates=num_updates)
+    of = partial(arm, train_colors=tuple(train_colors), num_updates=num_updates)
     return [
         of("ppo", "ppo"),
         of("ipo", "ipo"),
@@ -151,24 +155,47 @@ def main_arms(num_updates: int) -> list[Cell]:
     ]
 
 
-def turn_arms(num_updates: int) -> list[Cell]:
+def turn_arms(num_updates: int, train_colors: Sequence[str] = TRAINED) -> list[Cell]:
     """IPO without players and their average: one network, on one domain at a time."""
-    of = partial(arm, num_updates=num_updates)
+    of = partial(arm, train_colors=tuple(train_colors), num_updates=num_updates)
     return [
         of("in_turn", "in_turn", learning_rate=5e-4),
         of("in_turn_lr1e-3", "in_turn", learning_rate=1e-3),
     ]
 
 
-def variant_arms(num_updates: int) -> list[Cell]:
+def with_a_third(train_colors: Sequence[str]) -> tuple[str, ...]:
+    """Training colours and the first of the others."""
+    return (*train_colors, next(color for color in COLORS if color not in train_colors))
+
+
+def setting_names(train_colors: Sequence[str]) -> dict[str, str]:
+    """Names of the arms with a third colour and with normalised advantages, by label."""
+    three = in_words(with_a_third(train_colors))
+    return {
+        "ppo": "PPO, as published",
+        "ipo": "IPO, as published",
+        "ppo_3colors": f"PPO, {three}",
+        "ipo_3colors": f"IPO, {three}",
+        "ppo_normalized": "PPO, advantages normalised",
+        "ipo_normalized": "IPO, advantages normalised",
+    }
+
+
+def in_words(colors: Sequence[str]) -> str:
+    """Such as "red, green and blue"."""
+    return f"{', '.join(colors[:-1])} and {colors[-1]}"
+
+
+def variant_arms(num_updates: int, train_colors: Sequence[str] = TRAINED) -> list[Cell]:
     """A third colour, normalised advantages, a test inside the range of codes, other encodings."""
-    of = partial(arm, num_updates=num_updates)
+    of = partial(arm, train_colors=tuple(train_colors), num_updates=num_updates)
     arms = []
     for method in ("ppo", "ipo"):
         arms += [
-            of(f"{method}_3colors", method, ("red", "green", "blue")),
+            of(f"{method}_3colors", method, train_colors=with_a_third(train_colors)),
             of(f"{method}_normalized", method, normalize_advantages="minibatch"),
-            of(f"{method}_inside", method, ("red", "yellow")),
+            of(f"{method}_inside", method, train_colors=INSIDE),
         ]
     for encoding in ("one_hot", "none"):
         arms += [
@@ -179,10 +206,11 @@ def variant_arms(num_updates: int) -> list[Cell]:
     return arms
 
 
-def larger_arms(num_updates: int, size: int) -> list[Cell]:
+def larger_arms(num_updates: int, size: int, train_colors: Sequence[str] = TRAINED) -> list[Cell]:
     """Both methods on a larger grid, with the same number of updates and four times as many."""
+    of = partial(arm, train_colors=tuple(train_colors), size=size)
     return [
-        arm(f"{method}{suffix}", method, size=size, num_updates=factor * num_updates)
+        of(f"{method}{suffix}", method, num_updates=factor * num_updates)
         for suffix, factor in (("", 1), ("_long", 4))
         for method in ("ppo", "ipo")
     ]
@@ -505,9 +533,9 @@ def p_of_spreads(rows: pd.DataFrame, metric: str) -> float:
 
 
 def encodings(
-    main: pd.DataFrame, variants: pd.DataFrame
-) -> dict[str, tuple[pd.DataFrame, tuple[str, ...]]]:
-    """What networks see of colours: rows and training colours by encoding.
+    main: pd.DataFrame, variants: pd.DataFrame, train_colors: Sequence[str] = TRAINED
+) -> dict[str, tuple[str, pd.DataFrame, Sequence[str]]]:
+    """What networks see of colours: title, rows and training colours by encoding.
 
     The rows have the ``code`` of their domain's colour, and arms go by their plain names.
     """
@@ -519,12 +547,16 @@ def encodings(
     def encoded(name: str) -> pd.DataFrame:
         return by_code(variants[variants["color_encoding"] == name])
 
-    inside = variants[variants["train_colors"] == "red+yellow"]
+    inside = variants[variants["method"].str.endswith("_inside")]
+    panels = {
+        "integer": ("integer", by_code(main), train_colors),
+        "inside": ("integer", by_code(inside), INSIDE),
+        "one_hot": ("one-hot", encoded("one_hot"), train_colors),
+        "none": ("no colour", encoded("none"), train_colors),
+    }
     return {
-        "integer, red and green": (by_code(main), TRAINED),
-        "integer, red and yellow": (by_code(inside), ("red", "yellow")),
-        "one-hot, red and green": (encoded("one_hot"), TRAINED),
-        "no colour, red and green": (encoded("none"), TRAINED),
+        name: (f"{seen}, {in_words(colors)}", rows, colors)
+        for name, (seen, rows, colors) in panels.items()
     }
 
 
@@ -535,9 +567,9 @@ STEPS = {
 }
 
 
-def subtasks(rows: pd.DataFrame) -> pd.DataFrame:
-    """Probability of each step of the task on red and on grey, by arm: the mean over runs."""
-    colors = ("red", TESTED)
+def subtasks(rows: pd.DataFrame, color: str) -> pd.DataFrame:
+    """Probability of each step of the task on a colour and on grey, by arm: the mean over runs."""
+    colors = (color, TESTED)
     chosen = rows[rows["metric"].isin(STEPS) & rows["domain"].isin(colors)]
     means = chosen.groupby(["method", "domain", "metric"])["value"].mean().unstack()
     order = list(itertools.product(MAIN, colors))

@@ -30,6 +30,7 @@ from experiments.orphans import interrupt_on_sigterm
 from experiments.registry import CHAPTERS, DATA, again, chosen
 from experiments.store import Batch, Store, timed
 from experiments.work import finished
+from ipo.checks import checked
 
 WITNESS = DATA / "witness"
 
@@ -114,8 +115,15 @@ def differences(part: Slice, rows: pd.DataFrame | str) -> list[str]:
     ]
 
 
+@checked
 def side_by_side(recorded: pd.DataFrame, rows: pd.DataFrame) -> pd.DataFrame | None:
-    """Recorded rows with what is computed now as ``value_now``; None if it is of other rows."""
+    """Recorded rows with what is computed now as ``value_now``; None if it is of other rows.
+
+    Raises:
+        ValueError: no recorded rows, from which nothing would differ.
+    """
+    if recorded.empty:
+        raise ValueError("recorded: has no rows, must have some")
     keys = [column for column in recorded.columns if column != "value"]
     if set(rows.columns) != set(recorded.columns):
         return None

@@ -1,24 +1,10 @@
 """Every notebook runs: by the build in the smoke profile, and by hand."""
 
-import subprocess
-import sys
-from pathlib import Path
-
 import nbformat
 import pytest
-import yaml
+from by_hand import NAMES, ROOT, papermill, run_elsewhere, shipped
 
-from chapters import DATA, tree_hash
-
-ROOT = Path(__file__).resolve().parents[2]
-NAMES = [path.stem for path in sorted((ROOT / "notebooks").glob("*.ipynb"))]
 QUICK = ("lqr", "your_own_domains")
-SMOKE = yaml.safe_load((ROOT / "notebooks" / "profiles" / "smoke.yml").read_text())
-
-
-def papermill(name: str, output: Path, *options: str) -> subprocess.CompletedProcess:
-    command = [sys.executable, "-m", "papermill", f"notebooks/{name}.ipynb", str(output), *options]
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -44,20 +30,12 @@ def test_runs_by_hand_with_rows_of_ones_own(tmp_path, name):
 
     No notebook depends on the folder (see test_sources), so the quick ones stand for all.
     """
-    parameters = SMOKE.get(name, {})
-    if "results_dir" in parameters:
-        parameters = parameters | {"results_dir": "rows"}
     before = shipped()
-    where = ("--cwd", str(tmp_path), "-y", yaml.safe_dump(parameters))
-    done = papermill(name, tmp_path / "out.ipynb", *where)
+    done = run_elsewhere(name, tmp_path, {})
     assert done.returncode == 0, done.stderr
     assert shipped() == before
     policies = tmp_path / "rows" / "policies"
     assert policies.exists() == (name in ("keys", "door"))
-
-
-def shipped() -> dict[str, str]:
-    return {name: tree_hash(ROOT / "data" / name) for name in DATA}
 
 
 @pytest.mark.parametrize("name", NAMES)

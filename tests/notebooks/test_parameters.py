@@ -1,13 +1,9 @@
 """Bad parameters of a notebook are refused by name in its first cells, before any work."""
 
-from pathlib import Path
-from typing import Any
+import re
 
-import nbformat
 import pytest
-
-NOTEBOOKS = Path(__file__).resolve().parents[2] / "notebooks"
-FIRST = 3  # code cells: the defaults, the checks, imports and the chapter
+from by_hand import NAMES, begin, defaults
 
 # By the type of the default; None stands for what may be left out.
 BAD = {
@@ -16,45 +12,36 @@ BAD = {
     str: (5, "", [3]),
     type(None): (0, 2.5, "three"),
 }
-ANYTHING = {"authors_repository"}  # a folder, which is looked at where it is used
-
-
-def first_cells(name: str) -> list[str]:
-    notebook = nbformat.read(NOTEBOOKS / f"{name}.ipynb", as_version=4)
-    return [cell.source for cell in notebook.cells if cell.cell_type == "code"][:FIRST]
-
-
-def defaults(name: str) -> dict[str, Any]:
-    namespace: dict[str, Any] = {}
-    exec(first_cells(name)[0], {}, namespace)
-    return namespace
-
-
-def begin(name: str, **given: Any) -> None:
-    """The first cells as papermill runs them, with its own cell of parameters after the first."""
-    given_cell = "\n".join(
-        ["# Parameters", *(f"{key} = {value!r}" for key, value in given.items())]
-    )
-    cells = first_cells(name)
-    cells.insert(1, given_cell)
-    namespace = {"In": ["", *cells[:2]]}
-    for source in cells:
-        exec(source, namespace)
 
 
 CASES = [
-    (path.stem, parameter, value)
-    for path in sorted(NOTEBOOKS.glob("*.ipynb"))
-    for parameter, default in defaults(path.stem).items()
-    if parameter not in ANYTHING
+    (name, parameter, value)
+    for name in NAMES
+    for parameter, default in defaults(name).items()
     for value in BAD[type(default)]
 ]
 
 
 @pytest.mark.parametrize(("name", "parameter", "value"), CASES)
 def test_bad_parameter_is_refused_by_name(name, parameter, value):
-    with pytest.raises((TypeError, ValueError), match=rf"^{parameter}(\[.*\])? = "):
+    with pytest.raises((TypeError, ValueError, OSError), match=rf"^{parameter}(\[.*\])? = "):
         begin(name, **{parameter: value})
+
+
+@pytest.mark.parametrize(
+    ("colors", "rule"),
+    [
+        (["red"], "two colours"),
+        (["red", "green", "blue"], "two colours"),
+        (["red", "red"], "not name a value twice"),
+        (["red", "gren"], "one of red, green, blue, purple, yellow; did you mean 'green'"),
+        (["red", "grey"], "one of red, green, blue, purple, yellow"),  # the test domain
+        ("red", "a list of some of"),
+    ],
+)
+def test_training_colours_that_cannot_be(colors, rule):
+    with pytest.raises(ValueError, match=rf"^train_colors.* = .*must .*{re.escape(rule)}"):
+        begin("keys", train_colors=colors)
 
 
 @pytest.mark.parametrize("name", sorted({name for name, *_ in CASES}))

@@ -1,4 +1,4 @@
-"""Bad input to every public function, class and method of ``ipo``: an error that names it.
+"""Bad input to every public function of ``ipo`` and of the book's tables: an error that names it.
 
 A row is something callable, good arguments, and for each parameter the kind of value that it must
 refuse. What is public is found by walking the package: without a row, or a reason in ``TRUSTING``
@@ -21,19 +21,21 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from small import paper_problem, random_gain
 
 import ipo
-from experiments import keys
+from experiments import keys, tables
 from experiments import lqr as lqr_experiments
 from experiments.chapter import Chapter
 from experiments.doors import success, training
 from experiments.experiment import Experiment
 from experiments.pictures import DoorPicture
 from experiments.store import Store
+from experiments.witness import side_by_side
 from ipo import game, lqr, lqr_learners, optimizers, own_domains, ppo, rollouts, stats
 from ipo.causality import icp, predictors, scalar_control, scm, small_games
 from ipo.distributions import Categorical
@@ -156,6 +158,7 @@ def rows() -> Iterator[Row]:
     yield from rows_of_causality()
     yield from rows_of_worlds()
     yield from rows_of_experiments()
+    yield from rows_of_tables()
 
 
 def rows_of_lqr() -> Iterator[Row]:
@@ -653,6 +656,44 @@ def rows_of_experiments() -> Iterator[Row]:
     )
 
 
+def rows_of_tables() -> Iterator[Row]:
+    """Where pandas would leave something out, or count it twice, and show a number all the same."""
+    where = {"method": ["a", "a", "b", "b"], "metric": "cost", "run": [0, 1, 0, 1]}
+    rows = pd.DataFrame(where | {"value": [1.0, 2.0, 3.0, INF]})
+    unfit = OBJECT + bad("sample size", rows[:0])
+    unfit += bad("range", rows.assign(value=[1.0, NAN, 3.0, 4.0]), rows.assign(run=0))
+    unfit += bad("kind of object", rows.drop(columns="run"), rows.drop(columns="value"))
+    values = OBJECT + bad("range", pd.Series([1.0, NAN])) + bad("sample size", pd.Series([]))
+    for function in (tables.mean_and_std, tables.mean_and_interval):
+        yield row(function, {"values": rows["value"][:3]}, values=values, digits=NATURAL)
+    yield row(
+        tables.show,
+        {"frame": rows},
+        frame=OBJECT,
+        formats=bad("choice", {"misspelt": "{:.1f}"}) + bad("kind of object", 3),
+    )
+    yield row(
+        tables.costs,
+        {"folder": Path(os.devnull) / "rows", "names": ["main"]},
+        folder=bad("kind of object", 3),
+        names=bad("kind of object", 3, "main", [3]) + bad("choice", ["misspelt"]),
+    )
+    yield row(tables.beside_shipped, {"live": rows, "shipped": rows}, live=unfit, shipped=unfit)
+    by = bad("choice", ["misspelt"]) + bad("kind of object", 3, "run") + bad("sample size", [])
+    pair = {"live": rows, "shipped": rows, "by": ["method"]}
+    yield row(tables.largest_differences, pair, live=unfit, shipped=unfit, by=by)
+    yield row(
+        tables.by_method,
+        {"rows": rows, "columns": "metric", "names": {"a": "A"}},
+        rows=unfit,
+        columns=bad("choice", "misspelt") + bad("kind of object", 3),
+        names=OBJECT[::2],
+        digits=NATURAL,
+    )
+    pair = {"recorded": rows, "rows": rows}
+    yield row(side_by_side, pair, recorded=OBJECT + bad("sample size", rows[:0]), rows=OBJECT)
+
+
 # ------------------------------------------------------- what is public, and need not be checked
 
 LOOP = "called in every step of a training: its arrays come from what was checked when it began"
@@ -700,21 +741,22 @@ TRUSTING = {
 
 
 def public() -> dict[str, Callable]:
-    """Every function, class and method of the package with a parameter that a caller chooses."""
+    """Every function, class and method with a parameter that a caller chooses."""
     found: dict[str, Callable] = {}
-    for module in pkgutil.walk_packages(ipo.__path__, "ipo."):
-        for name, thing in vars(importlib.import_module(module.name)).items():
-            if getattr(thing, "__module__", None) != module.name or name.startswith("_"):
+    modules = [module.name for module in pkgutil.walk_packages(ipo.__path__, "ipo.")]
+    for module in (*modules, tables.__name__):
+        for name, thing in vars(importlib.import_module(module)).items():
+            if getattr(thing, "__module__", None) != module or name.startswith("_"):
                 continue
             if inspect.isfunction(thing):
-                found[f"{module.name}.{name}"] = thing
+                found[f"{module}.{name}"] = thing
             elif inspect.isclass(thing) and not getattr(thing, "_is_protocol", False):
-                found[f"{module.name}.{name}"] = thing
+                found[f"{module}.{name}"] = thing
                 for method, function in inspect.getmembers_static(thing):
                     own = method in vars(thing) and (method[0] != "_" or method == "__call__")
                     function = getattr(function, "__func__", function)
                     if own and inspect.isfunction(function):
-                        found[f"{module.name}.{name}.{method}"] = function
+                        found[f"{module}.{name}.{method}"] = function
     return {name: thing for name, thing in found.items() if parameters(thing)}
 
 

@@ -186,8 +186,8 @@ def test_erm_in_closed_form_is_what_the_shipped_training_arrived_at():
 
 
 def test_tables_have_the_methods_in_the_order_of_their_names():
-    rows = rows_of("method metric", *[(m, "x", 3.0) for m in "bca"], *[(m, "x", 3.0) for m in "cb"])
-    rows = pd.concat([rows, rows[rows["method"] == "a"].assign(value=4.0)])
+    runs = [(method, "x", run, 3.0) for run in (0, 1) for method in "bca"]
+    rows = rows_of("method metric run", *runs[:-1], ("a", "x", 1, 4.0))
     table = by_method(rows, "metric", {"c": "see", "missing": "none", "a": "ay"}, digits=1)
     assert table["x"].to_dict() == {"see": "3.0 [3.0, 3.0]", "ay": "3.5 [3.0, 4.0]"}
 

@@ -495,7 +495,23 @@ def test_every_arm_of_a_table_has_a_name():
     assert experiment.MAIN.keys() == labels["main"]
     assert experiment.LARGER.keys() == labels["larger"]
     others = {arm for arm in labels["variants"] if arm.endswith(("3colors", "normalized"))}
-    assert experiment.SETTINGS.keys() == others | {"ppo", "ipo"}
+    assert experiment.setting_names(experiment.TRAINED).keys() == others | {"ppo", "ipo"}
+
+
+def test_arms_of_other_colours_differ_in_the_colours_alone():
+    """All but those whose colours stand for themselves, of codes with the others between them."""
+    colors = ("blue", "yellow")
+    for make, options in (
+        (experiment.main_arms, [20]),
+        (experiment.variant_arms, [20]),
+        (experiment.larger_arms, [20, 6]),
+    ):
+        for usual, other in zip(make(*options), make(*options, colors), strict=True):
+            fixed = usual.label.endswith("_inside")
+            three = usual.label.endswith("_3colors")
+            expected = usual.train_colors if fixed else (*colors, *["red"] * three)
+            assert other == replace(usual, train_colors=expected)
+    assert experiment.setting_names(colors)["ipo_3colors"] == "IPO, blue, yellow and red"
 
 
 # -------------------------------------------------------------------------- read off the rows
@@ -586,7 +602,9 @@ def test_computed_rows_stand_beside_the_shipped_ones_of_the_same_run():
 def test_encodings_keep_the_arms_of_each_network_apart(shipped):
     panels = experiment.encodings(shipped["main"], shipped["variants"])
     variants = shipped["variants"]
-    for (rows, colors), (suffix, encoding, arms) in zip(
+    titles = [title for title, *_ in panels.values()]
+    assert titles[1:3] == ["integer, red and yellow", "one-hot, red and green"]
+    for (_, rows, colors), (suffix, encoding, arms) in zip(
         panels.values(),
         [
             ("", "integer", MAIN),
@@ -605,7 +623,7 @@ def test_encodings_keep_the_arms_of_each_network_apart(shipped):
 
 
 def test_steps_of_the_task_follow_one_another(shipped):
-    steps = experiment.subtasks(shipped["main"])
+    steps = experiment.subtasks(shipped["main"], "red")
     assert list(steps.index) == [(arm, c) for arm in experiment.MAIN for c in ("red", "grey")]
     assert list(steps.columns) == ["holds the key", "unlocks the door", "reaches the goal"]
     expected = runs_of(shipped["main"], "ipo", "grey", "unlocks_door").mean()

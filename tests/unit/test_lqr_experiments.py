@@ -179,3 +179,10 @@ def test_live_rows_stand_beside_the_shipped_ones():
     )
     with pytest.raises(ValueError, match=r"shipped: has no row for \{.*'num_domains': 2"):
         beside_shipped(live, ROWS[ROWS["num_domains"] == 3])
+
+
+def test_an_unstable_run_differs_infinitely_from_all_but_an_unstable_one():
+    shipped = ROWS.head(3).assign(value=[np.inf, np.inf, 1.0])
+    both = beside_shipped(shipped.assign(value=[np.inf, 1.0, np.inf]), shipped)
+    for column in ("difference", "relative difference"):
+        assert both[column].tolist() == [0, np.inf, np.inf]

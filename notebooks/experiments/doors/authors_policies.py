@@ -51,9 +51,12 @@ def authors_policies(repository: str | Path) -> dict[str, list[list[Weights]]]:
         repository: a clone of github.com/irom-lab/Invariant-Policy-Optimization.
 
     Raises:
+        TypeError: not a folder's path.
         FileNotFoundError: no policies there.
         ValueError: a file that is not one of theirs.
     """
+    if not isinstance(repository, str | Path):
+        raise TypeError(f"authors_repository = {repository!r}: must be the path of a folder")
     policies = {}
     for method in ("ppo", "ipo"):
         folder = Path(repository) / FOLDER / method

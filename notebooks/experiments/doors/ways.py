@@ -165,15 +165,22 @@ def players_alone(cell: Cell, **options: Any) -> list[Cell]:
 def table_of_players(
     alone: pd.DataFrame, success: pd.DataFrame, cell: Cell, players: Sequence[Cell]
 ) -> pd.DataFrame:
-    """Percent of the same doors opened by each player alone and by their average."""
+    """Percent of the same doors opened by each player alone and by their average.
+
+    Nothing stands at frictions at which the average was not tested.
+    """
     average = success[success["door"] < players[0].num_doors]
     policies = {
         f"player of friction {friction}, alone": (alone, player)
         for friction, player in zip(TRAIN_FRICTIONS, players, strict=True)
     } | {"their average": (average, cell)}
+
+    def opened(rows: pd.DataFrame, who: Cell, friction: float) -> str:
+        found = rate(rows, who, friction)
+        return percent(found) if len(found) else ""
+
     return pd.DataFrame(
-        {"policy": name}
-        | {f"opened at {f}": percent(rate(rows, who, f)) for f in players[0].frictions}
+        {"policy": name} | {f"opened at {f}": opened(rows, who, f) for f in players[0].frictions}
         for name, (rows, who) in policies.items()
     )
 
