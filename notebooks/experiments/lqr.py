@@ -414,11 +414,28 @@ def _published(mean: float, std: float) -> str:
     return f"{mean:.1f}" if np.isnan(std) else f"{mean:.1f} ± {std}"
 
 
+TABLE_KEYS = ["method", "num_domains", "dim_distractor"]
+
+
+def mean_costs(rows: pd.DataFrame) -> pd.Series:
+    """Cost in a new domain, mean over runs, per cell of the two tables."""
+    return rows[rows["metric"] == "test_cost"].groupby(TABLE_KEYS)["value"].mean()
+
+
+def paper_costs(paper: pd.DataFrame) -> pd.Series:
+    """The paper's :func:`mean_costs`."""
+    return paper.drop_duplicates(TABLE_KEYS).set_index(TABLE_KEYS)["mean"]
+
+
 def difference_to_paper(rows: pd.DataFrame, paper: pd.DataFrame) -> pd.Series:
     """Mean cost in a new domain minus the paper's, per cell of the two tables."""
-    keys = ["method", "num_domains", "dim_distractor"]
-    ours = rows[rows["metric"] == "test_cost"].groupby(keys)["value"].mean()
-    return (ours - paper.drop_duplicates(keys).set_index(keys)["mean"]).dropna()
+    return (mean_costs(rows) - paper_costs(paper)).dropna()
+
+
+def num_lower(costs: pd.Series, baseline: str) -> str:
+    """In how many cells of the tables IPO, fixed Phi, costs less than a baseline, in words."""
+    lower = costs["ipo_fixed_phi"].lt(costs[baseline])
+    return f"{lower.sum()} of {len(lower)}"
 
 
 def in_words(differences: pd.Series) -> str:

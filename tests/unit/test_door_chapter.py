@@ -146,8 +146,15 @@ def test_numbers_of_the_verdict(success, paper):
     found = door_tables.verdict_numbers(success, ARMS, FRICTIONS, paper)
     assert (found["rate_ppo_low"], found["rate_ppo_high"]) == (50, 0)
     assert (found["paper_ipo_low"], found["worst_ipo_half"]) == (75, 0)
+    assert found["paper_gap"] == 25
     assert found["gradient_steps"] == 4 * 10 * 32 / 1000
     assert found["gradient_ratio"] == 2
+
+
+def test_minibatches_of_each_player():
+    """256 of them, of 32 doors with 4096 steps for PPO, of 24 and of 8 doors for IPO's players."""
+    sizes = [door_tables.minibatch_sizes(door_training.published_door(m)) for m in ("ppo", "ipo")]
+    assert sizes == ["512", "384 and 128"]
 
 
 def test_a_curve_is_read_at_the_first_record_that_is_late_enough():

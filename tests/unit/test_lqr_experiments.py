@@ -127,6 +127,13 @@ def test_cells_far_from_the_papers_are_named():
     assert lqr.in_words(difference[difference > 100]) == "none"
 
 
+def test_cells_in_which_ipo_costs_less_are_counted():
+    costs = lqr.mean_costs(ROWS)  # more by method, in the order of LQR_METHODS
+    assert lqr.num_lower(costs, "gradient_descent") == "0 of 2"
+    costs["gradient_descent", 3, 1000] = costs["ipo_fixed_phi", 3, 1000] + 0.1
+    assert lqr.num_lower(costs, "gradient_descent") == "1 of 2"
+
+
 def test_start_table_marks_the_start_of_the_tables():
     cells = lqr.start_cells(5, 1000, 100, 5000)
     rows = pd.DataFrame(

@@ -26,6 +26,7 @@ from experiments.doors.authors_policies import authors_policies
 from experiments.doors.success import Cell
 from experiments.doors.training import CURVE_FRICTION, EVALUATION_SEED, TRAIN_FRICTIONS, last_info
 from experiments.work import parallel
+from ipo.ppo import PPOSettings
 from ipo.stats import paired_difference, probability_of_improvement
 
 PAIRS = {
@@ -37,20 +38,29 @@ PAIRS = {
 }
 
 
-def training_numbers(curves: pd.DataFrame, arms: Mapping[str, Cell]) -> dict[str, float]:
-    """How many steps a training has, in millions, and how many core-minutes it took."""
+def training_numbers(curves: pd.DataFrame, arms: Mapping[str, Cell]) -> dict[str, float | str]:
+    """Steps of a training in millions, the core-minutes it took, and the sizes of minibatches."""
     seconds = curves[curves["metric"] == "cpu_seconds"].groupby(["method", "run"])["value"].max()
     minutes = (seconds / 60).groupby("method").mean()
     return {
         "million": arms["ppo"].columns["steps"] / 1e6,
         "million_half": arms["ppo_half"].columns["steps"] / 1e6,
+        "minibatch_ppo": minibatch_sizes(arms["ppo"].trained.settings),
+        "minibatch_ipo": minibatch_sizes(arms["ipo"].trained.settings),
     } | {f"minutes_{method}": value for method, value in minutes.items()}
+
+
+def minibatch_sizes(settings: PPOSettings) -> str:
+    """Steps in a minibatch of each player."""
+    copies = settings.copies(len(TRAIN_FRICTIONS))
+    sizes = [settings.size_of_minibatches(settings.num_steps * sum(own)) for own in copies]
+    return " and ".join(map(str, sizes))
 
 
 def curve_numbers(curves: pd.DataFrame, num_frames: int) -> dict[str, float]:
     """Doors opened after some millions of steps, and deviations in the end, by method."""
     wanted = {
-        **{f"train_{m}": (m, "success", TRAIN_FRICTIONS[-1]) for m in (2, 5, 10)},
+        **{f"train_{m}": (m, "success", TRAIN_FRICTIONS[-1]) for m in (2, 4, 5, 8, 10)},
         **{f"new_{m}": (m, "success_most_likely", CURVE_FRICTION) for m in (10, 25)},
         "deviation": (25, "deviation", "training"),
     }
@@ -201,7 +211,9 @@ def verdict_numbers(
             found[f"rate_{arm}_{place}"] = 100 * rate(success, arms[arm], friction).mean()
             found[f"paper_{method}_{place}"] = 100 * means[method, str(friction)]
     steps = {arm: gradient_steps(arms[arm]) for arm in ("ppo", "ipo")}
+    gaps = [means["ipo", str(friction)] - means["ppo", str(friction)] for friction in tested]
     return found | {
+        "paper_gap": 100 * np.mean(gaps),
         "gradient_steps": steps["ppo"],
         "gradient_ratio": steps["ipo"] / steps["ppo"],
         "num_minibatches": arms["ipo"].trained.settings.num_minibatches,
