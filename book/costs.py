@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from itertools import groupby
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import pandas as pd
 
 from experiments.registry import CHAPTERS, DATA
 from experiments.reproduce import cost, recorded, wall_seconds
+from experiments.sealed import read_record
 
 CORES = (1, 2, 4, 8, 16, 32, 64)
 SCALING = DATA / "bench" / "scaling.json"
@@ -19,7 +19,7 @@ def write_fragment(folder: Path) -> None:
     """Writes ``_generated/costs.md`` under ``folder``."""
     target = Path(folder) / "_generated"
     target.mkdir(parents=True, exist_ok=True)
-    bench = json.loads(SCALING.read_text(encoding="utf-8"))
+    bench = read_record(SCALING)
     text = "\n\n".join([core_hours(), scaling(bench), wall_hours(bench), limits(bench)])
     (target / "costs.md").write_text(text + "\n", encoding="utf-8")
 

@@ -11,7 +11,6 @@ most doublings: later it is faster, while the straightforward implementation sta
 from __future__ import annotations
 
 import argparse
-import json
 import statistics
 import sys
 import time
@@ -22,7 +21,7 @@ from pathlib import Path
 import torch
 from tqdm import tqdm
 
-from experiments.files import replace_text
+from experiments.sealed import write_record
 from ipo.game import LinearPlayers
 from ipo.lqr import sample_problem
 from ipo.lqr_learners import LQR_METHODS, published_lqr, train
@@ -137,7 +136,7 @@ def main() -> None:
         print(f"{name:46}" + "".join(f"{value:10.1f}" for value in row.values()))
     if options.json:
         numbers = {"relative_difference": difference, "rows": rows}
-        replace_text(options.json, json.dumps(numbers, indent=1) + "\n")
+        write_record(options.json, numbers)
 
 
 if __name__ == "__main__":

@@ -6,9 +6,11 @@ A job is a folder and a command that goes on where it was. Every fault gives an 
 
 from __future__ import annotations
 
+import contextlib
 import multiprocessing
 import os
 import signal
+import tempfile
 import time
 import traceback
 from collections.abc import Iterator, Sequence
@@ -43,26 +45,27 @@ class Job(Protocol):
 
 
 def start(job: Job) -> multiprocessing.Process:
-    """The command in a process of its own, whose messages go to ``log`` beside the folder."""
+    """The command in a process of its own, whose messages are kept."""
+    log = tempfile.TemporaryFile("w+", errors="replace")  # noqa: SIM115, it goes with the process
 
     def run() -> None:
         os.environ[MARK] = str(os.getppid())
-        with job.folder.with_suffix(".log").open("w") as log:
-            for stream in (1, 2):
-                os.dup2(log.fileno(), stream)
-            status = 1
-            try:
-                job.run()
-                status = 0
-            except SystemExit as end:
-                status = end.code
-            except BaseException:
-                traceback.print_exc()
-            finally:  # at once: what waits for idle workers at the end is for programs, not forks
-                os._exit(status)
+        for stream in (1, 2):
+            os.dup2(log.fileno(), stream)
+        status = 1
+        try:
+            job.run()
+            status = 0
+        except SystemExit as end:
+            status = end.code
+        except BaseException:
+            traceback.print_exc()
+        finally:  # at once: to wait for idle workers at the end is for programs, not for forks
+            os._exit(status)
 
     process = FORK.Process(target=run)
     process.start()
+    process.log = log
     return process
 
 
@@ -81,12 +84,13 @@ def ended(job: Job) -> Any:
     process = start(job)
     process.join()
     if process.exitcode:
-        raise RuntimeError(f"{job.folder}: {said(job)}")
+        raise RuntimeError(said(process))
     return job.result()
 
 
-def said(job: Job) -> str:
-    return job.folder.with_suffix(".log").read_text(errors="replace")
+def said(process: multiprocessing.Process) -> str:
+    process.log.seek(0)
+    return process.log.read()
 
 
 def kill(process: multiprocessing.Process, how: int, whole_tree: bool) -> str | None:
@@ -95,10 +99,8 @@ def kill(process: multiprocessing.Process, how: int, whole_tree: bool) -> str | 
     if whole_tree:
         victims += victims[0].children(recursive=True)
     for victim in victims:
-        try:
+        with contextlib.suppress(psutil.NoSuchProcess):  # one of the short ones
             victim.send_signal(how)
-        except psutil.NoSuchProcess:  # one of the short ones
-            pass
     process.join(SECONDS_TO_END)
     if process.exitcode is None:
         process.kill()
@@ -151,7 +153,9 @@ def killed(
             if process.exitcode != 0:  # it may have ended by itself between the two looks
                 outcomes.append(problem or (f"{lost} lost" if lost else HELD))
                 continue
-        problem = f"failed: {said(job)}" if process.exitcode else differs(job.result(), expected)
+        problem = (
+            f"failed: {said(process)}" if process.exitcode else differs(job.result(), expected)
+        )
         if problem and len(outcomes) > num_before:
             outcomes[-1] = problem
         job.begin()
