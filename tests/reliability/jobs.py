@@ -131,6 +131,7 @@ class Build:
         self.site = folder / "book" / "_build" / "html"
         write_toy(folder)
         (folder / "book" / "run_times.md").write_text("# Run times\n")  # they are never the same
+        write_notebook(folder, "painted", CELLS["painted"][:1])  # without the toy's package
         self.complete = ["", ""]
         for _ in range(2):
             whole(self)
