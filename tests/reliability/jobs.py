@@ -64,8 +64,8 @@ class Sweep:
     def seen(self) -> set[str]:
         return lines(self.folder, "toy")
 
-    def result(self) -> tuple:
-        return (self.folder / "toy.csv").read_bytes(), left(self.folder)
+    def result(self) -> bytes:
+        return (self.folder / "toy.csv").read_bytes()
 
 
 class DoorTraining:
@@ -112,7 +112,7 @@ class DoorTraining:
 
     def result(self) -> tuple:
         rows = {line for line in lines(self.folder, "curves") if "cpu_seconds" not in line}
-        return rows, {p.name: tensors(p) for p in self.places.policies.iterdir()}, left(self.folder)
+        return rows, {path.name: tensors(path) for path in self.places.policies.glob("*.s*")}
 
 
 def tensors(path: Path) -> str:
@@ -191,5 +191,5 @@ class Reproduce:
         names = ("trained", "played")
         return {(name, row) for name in names for row in lines(self.reproduced / "lqr", name)}
 
-    def result(self) -> tuple:
-        return self.seen(), left(self.reproduced)
+    def result(self) -> set[tuple[str, str]]:
+        return self.seen()
