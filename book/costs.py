@@ -94,7 +94,7 @@ def limits(bench: dict) -> str:
     )
 
 
-def in_markdown(table: pd.DataFrame) -> str:
-    """A table of text whose columns but the first are numbers."""
-    align = ["left"] + ["right"] * (table.shape[1] - 1)
+def in_markdown(table: pd.DataFrame, num_words: int = 1) -> str:
+    """A table of text whose columns but the first ones are numbers."""
+    align = ["left"] * num_words + ["right"] * (table.shape[1] - num_words)
     return table.to_markdown(index=False, colalign=align, disable_numparse=True)
