@@ -1,11 +1,17 @@
 """Faults that are there are counted; a few of two kinds, and with -m slow one of every kind."""
 
+import json
+import time
+from pathlib import Path
+
 import count_faults
 import numpy as np
 import pytest
 from damaged import flipped
-from faults import HARMLESS, HELD, count, killed
+from faults import HARMLESS, HELD, killed
 from jobs import Sweep
+
+from experiments.files import replace_text
 
 QUICK = ("bits", "hostile files")
 
@@ -32,20 +38,39 @@ def test_a_killed_sweep_loses_nothing(tmp_path, generator):
     assert killed(Sweep(tmp_path / "sweep"), generator, 2) == [HELD, HELD]
 
 
-class Forgetful(Sweep):
-    """It ends with other rows than before."""
+class Steps:
+    """A job that keeps its steps in a file, and may do the last one again when it goes on."""
 
-    num = 0
+    def __init__(self, folder: Path, again: bool) -> None:
+        self.folder, self.again = folder, again
 
-    def result(self) -> int:
-        self.num += 1
-        return self.num
+    def begin(self) -> None:
+        self.folder.mkdir(exist_ok=True)
+        self._write([])
+
+    def run(self) -> None:
+        steps = self._read()
+        for number in range(len(steps) - self.again, 40):
+            steps.append(number)
+            self._write(steps)
+            time.sleep(0.01)
+
+    def seen(self) -> set[int]:
+        return set(self._read())
+
+    def result(self) -> list[int]:
+        return self._read()
+
+    def _read(self) -> list[int]:
+        return json.loads((self.folder / "steps").read_text())
+
+    def _write(self, steps: list[int]) -> None:
+        replace_text(self.folder / "steps", json.dumps(steps))
 
 
 def test_another_end_is_counted_as_lost(tmp_path, generator):
-    row = count("kill", "sweep", killed(Forgetful(tmp_path / "sweep"), generator, 1))
-    assert (row["tried"], row["held"], row["lost"]) == (1, 0, 1)
-    assert row["how"] == ["ended with another result"]
+    assert killed(Steps(tmp_path / "job", again=False), generator, 4) == [HELD] * 4
+    assert "ended with another result" in killed(Steps(tmp_path / "job", again=True), generator, 4)
 
 
 def words(folder):
