@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 from experiments.registry import DATA
+from experiments.sealed import read_record
 
 RECORD = DATA / "bench" / "own_domains.json"
 
@@ -18,7 +18,7 @@ def write_fragment(folder: Path) -> None:
 
 
 def table() -> str:
-    record = json.loads(RECORD.read_text())
+    record = read_record(RECORD)
     lines = ["| Environment | | Frames per CPU second | Return |", "|:--|:--|--:|--:|"]
     for row in record["rows"]:
         speed, value = f"{row['frames_per_cpu_second']:,.0f}", f"{row['return']:,.0f}"

@@ -49,7 +49,11 @@ def load_paper(name: str, data: Path = DATA) -> pd.DataFrame:
 
 
 def read_claims(data: Path = DATA) -> dict:
-    return yaml.safe_load((data / "claims.yml").read_text(encoding="utf-8"))
+    path = data / "claims.yml"
+    try:
+        return yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path}: cannot be read: {error}") from error
 
 
 def decide(claim: dict, book: dict, data: Path = DATA) -> Finding:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from itertools import groupby
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import pandas as pd
 
 from experiments.registry import CHAPTERS, DATA
 from experiments.reproduce import cost, recorded, wall_seconds
+from experiments.sealed import read_record
 
 CORES = (1, 2, 4, 8, 16, 32, 64)
 SCALING = DATA / "bench" / "scaling.json"
@@ -19,7 +19,7 @@ def write_fragment(folder: Path) -> None:
     """Writes ``_generated/costs.md`` under ``folder``."""
     target = Path(folder) / "_generated"
     target.mkdir(parents=True, exist_ok=True)
-    bench = json.loads(SCALING.read_text(encoding="utf-8"))
+    bench = read_record(SCALING)
     text = "\n\n".join([core_hours(), scaling(bench), wall_hours(bench), limits(bench)])
     (target / "costs.md").write_text(text + "\n", encoding="utf-8")
 
@@ -94,7 +94,7 @@ def limits(bench: dict) -> str:
     )
 
 
-def in_markdown(table: pd.DataFrame) -> str:
-    """A table of text whose columns but the first are numbers."""
-    align = ["left"] + ["right"] * (table.shape[1] - 1)
+def in_markdown(table: pd.DataFrame, num_words: int = 1) -> str:
+    """A table of text whose columns but the first ones are numbers."""
+    align = ["left"] * num_words + ["right"] * (table.shape[1] - num_words)
     return table.to_markdown(index=False, colalign=align, disable_numparse=True)

@@ -15,6 +15,7 @@ import claims
 import costs
 import licences
 import provenance
+import reliability
 from chapters import Notebook, tree_hash
 from experiments.files import replace_text
 from experiments.orphans import python
@@ -52,6 +53,7 @@ def stage(root: Path, source: Path, notebooks: list[Notebook], profile: str) -> 
         nbformat.write(notebook.read_executed(), source / f"{notebook.name}.ipynb")
     claims.write_fragments(source)
     provenance.write_fragment(source)
+    reliability.write_fragment(source)
     benchmarks.write_fragment(source)
     costs.write_fragment(source)
     licences.write_fragment(source)

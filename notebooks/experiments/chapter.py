@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import sys
 import tempfile
@@ -20,6 +19,7 @@ from experiments import figures, tables
 from experiments.experiment import Cell, Experiment, Places, rebuilt
 from experiments.origin import ROOT
 from experiments.paper import read_paper
+from experiments.sealed import read_record
 from experiments.store import Batch, Store, timed
 from ipo.checks import Count, checked
 
@@ -109,8 +109,7 @@ class Chapter:
 
     def bench(self) -> dict[str, Any]:
         """What the chapter's benchmark, under ``tests/bench``, wrote down."""
-        path = ROOT / "data" / "bench" / f"{self.name}.json"
-        return json.loads(path.read_text(encoding="utf-8"))
+        return read_record(ROOT / "data" / "bench" / f"{self.name}.json")
 
     def costs(self, *names: str) -> Styler:
         """What it took to compute experiments, from the record beside the rows of each."""

@@ -32,9 +32,9 @@ from filelock import FileLock
 from tqdm import tqdm
 
 from experiments import origin
-from experiments.files import replace_text
 from experiments.orphans import interrupt_on_sigterm
 from experiments.registry import DATA, chosen
+from experiments.sealed import read_record, write_record
 from experiments.store import Store, select
 from experiments.witness import Slice, side_by_side, within
 from experiments.work import finished
@@ -85,7 +85,7 @@ def confirm(
 
 def confirmed() -> dict[str, dict[str, Any]]:
     """The record: by cell how it was confirmed, when, and at which commit of the code."""
-    return json.loads(CONFIRMED.read_text(encoding="utf-8")) if CONFIRMED.exists() else {}
+    return read_record(CONFIRMED) if CONFIRMED.exists() else {}
 
 
 def compared(part: Slice, rows: pd.DataFrame) -> str:
@@ -150,8 +150,7 @@ def _is_done(done: dict[str, dict[str, Any]], name: str, since: str | None) -> b
 
 def _save(name: str, outcome: dict[str, Any]) -> None:
     with FileLock(CONFIRMED.with_suffix(".lock")):
-        record = dict(sorted((confirmed() | {name: outcome}).items()))
-        replace_text(CONFIRMED, json.dumps(record, indent=1) + "\n")
+        write_record(CONFIRMED, dict(sorted((confirmed() | {name: outcome}).items())))
 
 
 def main() -> None:

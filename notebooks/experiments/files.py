@@ -12,6 +12,9 @@ def replace_bytes(path: Path, content: bytes) -> None:
     """Write to a temporary file beside it, read that back, and rename it.
 
     If any of it fails, what was there stays, and nothing is left beside it.
+
+    Raises:
+        OSError: it cannot be written; the error names the file.
     """
     temporary = None
     try:
@@ -24,10 +27,11 @@ def replace_bytes(path: Path, content: bytes) -> None:
             raise OSError(errno.EIO, "what was written does not come back", str(path))
         temporary.chmod(0o644)
         os.replace(temporary, path)
-    except BaseException:
+    except OSError as error:  # of a full disk, which does not say for which file
+        raise OSError(error.errno, error.strerror, str(path)) from error
+    finally:
         if temporary is not None:
             temporary.unlink(missing_ok=True)
-        raise
 
 
 def replace_text(path: Path, text: str) -> None:

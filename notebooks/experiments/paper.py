@@ -27,7 +27,7 @@ def read_paper(name: str, folder: Path = PAPER) -> pd.DataFrame:
     path, sums = folder / f"{name}.csv", folder / "SHA256SUMS"
     content = path.read_bytes()
     line = f"{hashlib.sha256(content).hexdigest()}  {path.name}"
-    if line not in sums.read_text(encoding="utf-8").splitlines():
+    if line.encode() not in sums.read_bytes().splitlines():
         raise DamagedError(
             f"{path}: is not as {sums.name} beside it has it; restore it, or record a correction "
             f"there: {line}"

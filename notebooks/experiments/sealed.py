@@ -1,16 +1,21 @@
 """Files behind a seal, the SHA-256 of all that follows it: a changed bit anywhere is an error.
 
-The seal is a line of 64 hexadecimal digits. ``tail --bytes=+66`` shows what it seals.
+The seal is a line of 64 hexadecimal digits. ``tail --bytes=+66`` shows what it seals. A record, in
+JSON that others read as it is, has its seal as the last of its entries instead.
 """
 
 from __future__ import annotations
 
 import hashlib
+import json
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
-from experiments.files import replace_bytes
+from experiments.files import replace_bytes, replace_text
 
 SEAL_LENGTH = 65  # with its line feed
+SEAL = "sha256"  # the entry of a record
 
 
 class DamagedError(ValueError):
@@ -41,6 +46,30 @@ def digest_of(path: Path) -> str:
     if not path.exists():
         return "no such file"
     return hashlib.sha256(read_sealed(path)).hexdigest()[:16]
+
+
+def write_record(path: Path, record: Mapping[str, Any]) -> None:
+    """Replace the file by plain values in JSON, and their seal."""
+    replace_text(path, json.dumps({**record, SEAL: _seal_of(record)}, indent=1) + "\n")
+
+
+def read_record(path: Path) -> dict[str, Any]:
+    """The plain values, without their seal.
+
+    Raises:
+        DamagedError: a file that is cut short or changed, or that never had a seal.
+    """
+    try:
+        record = dict(json.loads(path.read_bytes()))
+    except (ValueError, TypeError, RecursionError) as error:
+        raise DamagedError(f"{path}: is cut short or changed: {error}") from error
+    if record.pop(SEAL, None) != _seal_of(record):
+        raise DamagedError(f"{path}: is cut short or changed; restore the file")
+    return record
+
+
+def _seal_of(record: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(record).encode()).hexdigest()
 
 
 def _seal(content: bytes) -> bytes:

@@ -33,11 +33,10 @@ from experiments import origin
 from experiments.experiment import Cell, Experiment, difference, filled, plain
 from experiments.files import check_file_name, replace_text
 from experiments.rows import ResultsError, check_rows, types_of
-from experiments.sealed import digest_of
+from experiments.sealed import DamagedError, digest_of, read_record, write_record
 from experiments.work import finished
 from ipo.checks import Seeds, check_count, checked
 
-KEYS = {"columns", "cell", "run", "options", "seeds", "reads", "num_rows", "sha256"}  # of a batch
 TYPES = {"str": str, "bool": bool, "int64": int, "float64": float}  # a bool is an int, too
 NO_ROWS = pd.DataFrame({"run": pd.Series(dtype=int)})
 
@@ -208,12 +207,9 @@ class Store:
                 )
             return {}, []
         try:
-            record = json.loads(self.json.read_text(encoding="utf-8"))
-            types, batches = dict(record["types"]), list(record["batches"])
-            for batch in batches:
-                if absent := KEYS - batch.keys():
-                    raise KeyError(f"a batch without {min(absent)}")
-        except (ValueError, KeyError, TypeError, AttributeError, OSError) as error:
+            record = read_record(self.json)
+            types, batches = record["types"], record["batches"]
+        except (DamagedError, KeyError, OSError) as error:
             raise ResultsError(f"{self.json.with_suffix('')}: cannot be read: {error}") from error
         return types if batches else {}, batches
 
@@ -297,8 +293,7 @@ class Store:
 
     def write_record(self, rows: pd.DataFrame, batches: list[Batch]) -> None:
         """Replace the record of these rows."""
-        record = {"types": types_of(rows), "batches": batches}
-        replace_text(self.json, json.dumps(record, indent=1) + "\n")
+        write_record(self.json, {"types": types_of(rows), "batches": batches})
 
     def _check_storable(self, cells: Sequence[Cell]) -> None:
         """Whether what cells have in their columns is of types that come back, and of the file's.

@@ -6,6 +6,7 @@ import hashlib
 import io
 import json
 import warnings
+import zipfile
 from collections.abc import Callable
 from dataclasses import fields
 from importlib.metadata import version
@@ -15,9 +16,11 @@ import numpy as np
 from filelock import FileLock
 from gymnasium import Env
 
-from experiments.sealed import DamagedError, read_sealed, write_sealed
+from experiments.sealed import read_sealed, write_sealed
 from ipo.worlds.tabular import TabularTask, goal_reward, state_of, tabulate
 
+# A file that is damaged or has objects; of code with other fields; no archive; larger than memory.
+UNUSABLE = (ValueError, KeyError, EOFError, zipfile.BadZipFile, MemoryError)
 NUM_STEPS = 200  # of random episodes in which a table and its environment are compared
 
 
@@ -81,7 +84,7 @@ def _kept(path: Path, env: Env) -> TabularTask | None:
     try:
         with np.load(io.BytesIO(read_sealed(path))) as arrays:
             task = TabularTask(**{field.name: arrays[field.name] for field in fields(TabularTask)})
-    except (DamagedError, KeyError) as error:  # KeyError: of code that had other fields
+    except UNUSABLE as error:
         warnings.warn(f"{path}: is made anew: {error}", TableWarning, stacklevel=3)
         return None
     return task if agrees(task, env) else None

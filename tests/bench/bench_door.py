@@ -9,7 +9,6 @@ training needs is the published settings' rollout and updates, measured once and
 from __future__ import annotations
 
 import argparse
-import json
 import resource
 import statistics
 import time
@@ -22,7 +21,7 @@ from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
 from experiments.doors.training import NETWORK, new_training, published_door
-from experiments.files import replace_text
+from experiments.sealed import write_record
 from ipo.worlds.door import DoorEnv
 from ipo.worlds.many_doors import VectorDoor
 
@@ -134,7 +133,7 @@ def main() -> None:
     print(f"Memory at its peak: {memory:.2f} GiB")
     if options.json:
         numbers = {"speeds": speeds, "update_cpu_seconds": costs, "memory_gib": memory}
-        replace_text(options.json, json.dumps(numbers, indent=1) + "\n")
+        write_record(options.json, numbers)
 
 
 if __name__ == "__main__":

@@ -13,7 +13,6 @@ are scaled up. Tabulation happens once, before, and is shown apart.
 from __future__ import annotations
 
 import argparse
-import json
 import statistics
 import sys
 import tempfile
@@ -26,8 +25,8 @@ import torch
 from minigrid.wrappers import ImgObsWrapper
 from tqdm import tqdm
 
-from experiments.files import replace_text
 from experiments.keys import Cell, Keys, published
+from experiments.sealed import write_record
 from ipo.worlds.colored_keys import ColoredKeysEnv
 from ipo.worlds.tabular import expected_return, tabulate
 
@@ -151,7 +150,7 @@ def main() -> None:
         print(f"{name:48}" + "".join(f"{value:9.2f}" for value in row.values()) + goal)
     if options.json:
         content = {"updates": options.updates, "goals": GOALS, "rows": rows}
-        replace_text(options.json, json.dumps(content, indent=1) + "\n")
+        write_record(options.json, content)
 
 
 if __name__ == "__main__":

@@ -14,7 +14,6 @@ must be done, for ``B = Q = R = I``, without autograd, checks or parts. It shows
 from __future__ import annotations
 
 import argparse
-import json
 import statistics
 import sys
 import time
@@ -26,7 +25,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from experiments.files import replace_text
+from experiments.sealed import write_record
 from ipo.game import LinearPlayers
 from ipo.lqr import LQR, sample_problem
 from ipo.lqr_learners import LQR_METHODS, published_lqr, train
@@ -193,7 +192,7 @@ def main() -> None:
         print(f"{name:46}" + "".join(f"{value:10.1f}" for value in row.values()))
     if options.json:
         numbers = {"relative_difference": difference, "rows": rows}
-        replace_text(options.json, json.dumps(numbers, indent=1) + "\n")
+        write_record(options.json, numbers)
 
 
 if __name__ == "__main__":

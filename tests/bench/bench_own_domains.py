@@ -13,7 +13,6 @@ import argparse
 import contextlib
 import functools
 import io
-import json
 import statistics
 import time
 from pathlib import Path
@@ -25,7 +24,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from tqdm import tqdm
 
-from experiments.files import replace_text
+from experiments.sealed import write_record
 from ipo.own_domains import default_settings, evaluate_policy, train_policy
 from ipo.own_domains.copies import Make
 from ipo.own_domains.threads import one_thread
@@ -111,7 +110,7 @@ def main() -> None:
         )
     if options.json:
         numbers = {"frames": num_updates * FRAMES, "num_seeds": len(seeds), "rows": rows}
-        replace_text(options.json, json.dumps(numbers, indent=1) + "\n")
+        write_record(options.json, numbers)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,6 @@ CPU-seconds beside each other. Memory is that of a whole batch, in a process of 
 from __future__ import annotations
 
 import argparse
-import json
 import multiprocessing
 import os
 import resource
@@ -27,11 +26,11 @@ from threadpoolctl import threadpool_limits
 
 from experiments.doors.training import CELLS, shorter
 from experiments.experiment import Cell, Places
-from experiments.files import replace_text
 from experiments.keys import arm
 from experiments.lqr import published_cell
 from experiments.origin import machine
 from experiments.registry import CHAPTERS
+from experiments.sealed import write_record
 from experiments.store import timed
 from experiments.work import finished
 
@@ -104,7 +103,7 @@ def main() -> None:
     if options.json:
         median = {key: statistics.median(r[key] for r in rounds) for key in rounds[0]}
         numbers = {"machine": machine(), "rounds": len(rounds), "median": median, "gib": gib}
-        replace_text(options.json, json.dumps(numbers, indent=1) + "\n")
+        write_record(options.json, numbers)
 
 
 if __name__ == "__main__":

@@ -7,11 +7,12 @@ from pathlib import Path
 import pandas as pd
 import pytest
 import toy_experiment
+from toy_chapter import play, policy
 from toy_experiment import CELLS, Cell
 
 from experiments import confirm, registry, reproduce
 from experiments.experiment import Experiment, Places
-from experiments.sealed import read_sealed, write_sealed
+from experiments.sealed import write_sealed
 from experiments.store import Store, select
 
 STATE = {"shift": 0.0, "until": sys.maxsize}
@@ -23,17 +24,8 @@ def train(cell: Cell, seeds: list[int], policies: Path) -> pd.DataFrame:
         raise KeyboardInterrupt
     STATE["until"] -= 1
     rows = toy_experiment.run(cell, seeds)
-    write_sealed(policies / f"{cell.method}_{cell.size}", str(STATE["shift"]).encode())
+    write_sealed(policy(cell, 0, policies)[0], str(STATE["shift"]).encode())
     return rows.assign(value=rows["value"] + STATE["shift"])
-
-
-def policy(cell: Cell, seed: int, policies: Path) -> list[Path]:
-    return [policies / f"{cell.method}_{cell.size}"]
-
-
-def play(cell: Cell, seeds: list[int], policies: Path) -> pd.DataFrame:
-    rows = toy_experiment.run(cell, seeds)
-    return rows.assign(value=rows["value"] + float(read_sealed(policy(cell, 0, policies)[0])))
 
 
 @pytest.fixture

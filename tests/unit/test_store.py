@@ -19,7 +19,7 @@ import toy_experiment
 from toy_experiment import CELLS, SEEDS, Cell, fill
 
 from experiments.experiment import Experiment
-from experiments.sealed import DamagedError, write_sealed
+from experiments.sealed import DamagedError, read_record, write_record, write_sealed
 from experiments.store import OriginError, ResultsError, Store
 
 
@@ -233,7 +233,8 @@ DAMAGE = {
     "empty JSON": (edit("toy.json", r"(?s).+", ""), r"toy: cannot be read"),
     "JSON of something else": (edit("toy.json", '"batches"', '"rows"'), r"toy: cannot be read"),
     "JSON list": (edit("toy.json", r"(?s).+", "[]"), r"toy: cannot be read"),
-    "incomplete batch": (edit("toy.json", '"num_rows"', '"rows"'), r"toy: .* without num_rows"),
+    "other origin": (edit("toy.json", '"commit": "', '"commit": "0'), r"toy\.json: is cut short"),
+    "other seal": (edit("toy.json", r'"sha256"(?=[^{}]*}\n$)', '"seal"'), r"toy\.json: is cut"),
 } | {
     f"no column {column}": (without_column(column), rf"toy\.csv: column '{column}' is missing")
     for column in ("method", "size", "run", "domain", "metric", "value")
@@ -311,9 +312,11 @@ def test_an_option_that_rows_did_not_have_yet_is_its_default(folder):
 
 
 def test_an_option_that_is_no_more_is_named(folder):
-    text = (folder / "toy.json").read_text()
-    (folder / "toy.json").write_text(text.replace('"power": 0.5', '"root": 2'))
-    refused(folder, r"cell\.power = None, asked for 0\.5; cell\.root = 2, asked for None")
+    record = read_record(folder / "toy.json")
+    for batch in record["batches"]:
+        batch["cell"]["root"] = batch["cell"].pop("power")
+    write_record(folder / "toy.json", record)
+    refused(folder, r"cell\.power = None, asked for 0\.5; cell\.root = 0\.5, asked for None")
 
 
 def test_rows_of_another_run_function_are_refused(folder):

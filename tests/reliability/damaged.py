@@ -1,0 +1,263 @@
+"""Files that are damaged, a bit at a time, or made to do harm: whether their readers notice."""
+
+from __future__ import annotations
+
+import functools
+import io
+import json
+import pickle
+import shutil
+import tempfile
+import warnings
+import zipfile
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import numpy as np
+import torch
+from faults import HARMLESS, HELD
+from jobs import ROOT, Build
+
+import claims
+import website
+from experiments.checkpoints import load_checkpoint, save_checkpoint
+from experiments.doors.authors_policies import load_authors_policy
+from experiments.paper import read_paper
+from experiments.sealed import DamagedError, read_record, write_sealed
+from experiments.store import Store
+from experiments.tabulated import load_or_tabulate
+from experiments.tensors import read_tensors
+from ipo.worlds.colored_keys import ColoredKeysEnv
+from messages import BuildError
+from profiles import load_notebooks
+
+DATA = ROOT / "data"
+Read = Callable[[Path], Any]
+
+
+# ------------------------------------------------------------------------------ readers
+
+
+def read_rows(path: Path) -> tuple:
+    store = Store(path.parent, path.stem)
+    return store.rows().to_csv(), json.dumps(store.batches())
+
+
+def read_policy(path: Path) -> str:
+    tensors, about = read_tensors(path, "about")
+    return repr(({name: tensor.numpy().tobytes() for name, tensor in tensors.items()}, about))
+
+
+def read_checkpoint(path: Path) -> str:
+    return repr(load_checkpoint(path))
+
+
+def read_table(path: Path) -> bytes:
+    """The table, whose making anew is a warning."""
+    task = load_or_tabulate(ColoredKeysEnv, path.parent, size=5)
+    return b"".join(np.asarray(array).tobytes() for array in vars(task).values())
+
+
+def read_papers(path: Path) -> str:
+    return "".join(read_paper(p.stem, p.parent).to_csv() for p in sorted(path.parent.glob("*.csv")))
+
+
+def read_all_claims(path: Path) -> str:
+    return repr(claims.read_claims(path.parent))
+
+
+def read_executed(path: Path) -> str:
+    """A notebook's executed copy or record, where a damaged one is made anew."""
+    root = path.parents[3]
+    for notebook in load_notebooks(root, path.parent.name, path.parent):
+        if not notebook.is_current():
+            raise DamagedError(f"{path} is made anew")
+    return "current"
+
+
+def read_site(path: Path) -> str:
+    """A page, where a damaged site is built anew."""
+    root = next(parent for parent in path.parents if (parent / "_toc.yml").exists())
+    again = mock.Mock(side_effect=BuildError(f"{path} is built anew"))
+    with mock.patch.object(website, "run_jupyter_book", again):
+        built = root / "book" / "_build"
+        notebooks = load_notebooks(root, "class", root / "book" / "_executed" / "class")
+        website.build_site(root, built, notebooks, "class")
+    return "current"
+
+
+# -------------------------------------------------------------------------------- files
+
+
+def copied(pattern: str, name: str, folder: Path) -> Path:
+    """Of the files of a pattern in ``data/``, all copied, the one of that name."""
+    folder.mkdir()
+    for path in DATA.glob(pattern):
+        shutil.copy(path, folder)
+    return folder / name
+
+
+def new_checkpoint(folder: Path) -> Path:
+    for number in range(2):
+        tree = {"number": number, "weights": torch.arange(50.0) + number}
+        save_checkpoint(folder / "c.checkpoint", tree)
+    return folder / "c.checkpoint"
+
+
+def new_table(folder: Path) -> Path:
+    load_or_tabulate(ColoredKeysEnv, folder, size=5)
+    return next(folder.glob("*.table"))
+
+
+@functools.cache
+def built_book() -> tempfile.TemporaryDirectory:
+    """A toy book that is built, once."""
+    scratch = tempfile.TemporaryDirectory()
+    Build(Path(scratch.name) / "book")
+    return scratch
+
+
+def in_book(name: str, folder: Path) -> Path:
+    """A file of a copy of it."""
+    shutil.copytree(Path(built_book().name) / "book", folder)
+    return folder / "book" / name
+
+
+# -------------------------------------------------------------------------------- faults
+
+
+def outcome(read: Read, path: Path, expected: Any) -> str:
+    """Whether a reader refuses a file by its name, or gives the same as before."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", UserWarning)  # as a damaged check-point is
+            found = read(path)
+    except (ValueError, UserWarning, BuildError) as error:
+        return HELD if path.stem in str(error) else f"refused without a name: {error!r}"
+    except Exception as error:
+        return f"not refused, but a crash: {error!r}"
+    return HARMLESS if found == expected else "silent"
+
+
+def flipped(
+    make: Callable[[Path], Path], read: Read, folder: Path, generator: np.random.Generator, num: int
+) -> Iterator[str]:
+    """One bit of the file is changed, anywhere."""
+    path = make(folder)
+    content, expected = path.read_bytes(), read(path)
+    for _ in range(num):
+        place, bit = int(generator.integers(len(content))), int(generator.integers(8))
+        path.write_bytes(
+            content[:place] + bytes([content[place] ^ 1 << bit]) + content[place + 1 :]
+        )
+        yield outcome(read, path, expected)
+        path.write_bytes(content)
+
+
+class Harm:
+    """Unpickled, it makes a file."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple:
+        return Path.touch, (self.path,)
+
+
+def huge_tensors() -> bytes:
+    """Tensors larger than any memory, by what their header says."""
+    entry = {"dtype": "F32", "shape": [2**40], "data_offsets": [0, 2**42]}
+    header = json.dumps({"__metadata__": {"about": "{}", "tree": "{}"}, "w": entry}).encode()
+    return len(header).to_bytes(8, "little") + header
+
+
+def huge_array() -> bytes:
+    """An archive with an array larger than any memory, by what its header says."""
+    content = io.BytesIO()
+    np.lib.format.write_array_header_1_0(
+        content, {"descr": "<f8", "fortran_order": False, "shape": (2**50,)}
+    )
+    archive = io.BytesIO()
+    with zipfile.ZipFile(archive, "w") as file:
+        file.writestr("images.npy", content.getvalue())
+    return archive.getvalue()
+
+
+def objects(harm: Harm) -> bytes:
+    """An archive with an array of objects, which are pickled."""
+    archive = io.BytesIO()
+    np.savez(archive, images=np.array([harm], dtype=object))
+    return archive.getvalue()
+
+
+def hostile(folder: Path, generator: np.random.Generator, num: int) -> Iterator[str]:
+    """Files in the place of others, behind the right seal where there is one."""
+    folder.mkdir()
+    harm = Harm(folder / "harm")
+    pickled = pickle.dumps(harm)
+    table = new_table(folder / "tables").name
+    sealed = [
+        (read, name, content)
+        for read, name, contents in (
+            (read_policy, "a.safetensors", [huge_tensors(), (2**62).to_bytes(8, "little")]),
+            (read_checkpoint, "a.checkpoint", [huge_tensors(), (2**62).to_bytes(8, "little")]),
+            (read_table, f"tables/{table}", [huge_array(), objects(harm)]),
+        )
+        for content in (*contents, pickled, b"")
+    ]
+    for read, name, content in sealed:
+        write_sealed(folder / name, content)
+        yield _refused(read, folder / name, harm)
+    plain = [
+        (read_policy, "b.safetensors", pickled),
+        (read_checkpoint, "b.checkpoint", pickled),
+        (read_table, f"tables/{table}", pickled),
+        (load_authors_policy, "authors.pt", pickled),
+        (read_rows, "rows.json", pickled),
+        (read_rows, "rows.json", b"[" * 10**6),
+        (read_record, "confirmed.json", b'{"a":' * 10**6),
+        (read_all_claims, "claims.yml", f"!!python/object/apply:os.mkdir [{harm.path}]".encode()),
+    ]
+    for read, name, content in plain:
+        (folder / name).write_bytes(content)
+        yield _refused(read, folder / name, harm)
+
+
+def _refused(read: Read, path: Path, harm: Harm) -> str:
+    found = outcome(read, path, expected=None)
+    return "its code was executed" if harm.path.exists() else found
+
+
+def flips(where: str, make: Callable[[Path], Path], read: Read, num: int = 60) -> tuple:
+    return "a bit flips", where, num, partial(flipped, make, read)
+
+
+ROWS, WITNESS = "results/causality/linear.*", "witness/lqr/tables.*"
+POLICY = "ppo_red+green_none_5.safetensors"
+KINDS = {
+    "bits": [
+        flips("results, rows", partial(copied, ROWS, "linear.csv"), read_rows),
+        flips("results, origin", partial(copied, ROWS, "linear.json"), read_rows),
+        flips("witness, rows", partial(copied, WITNESS, "tables.csv"), read_rows),
+        flips("witness, origin", partial(copied, WITNESS, "tables.json"), read_rows),
+        flips("policy", partial(copied, f"policies/keys/{POLICY}", POLICY), read_policy),
+        flips("check-point", new_checkpoint, read_checkpoint),
+        flips("table of a task", new_table, read_table),
+        flips("the paper's numbers", partial(copied, "paper/*", "lqr.csv"), read_papers),
+        flips("their digests", partial(copied, "paper/*", "SHA256SUMS"), read_papers),
+        flips("confirmations", partial(copied, "confirmed.json", "confirmed.json"), read_record),
+        flips("benchmarks", partial(copied, "bench/lqr.json", "lqr.json"), read_record),
+    ],
+    "bits of a book": [
+        flips("executed notebook", partial(in_book, "_executed/class/plain.ipynb"), read_executed),
+        flips("its record", partial(in_book, "_executed/class/plain.json"), read_executed),
+        flips("page", partial(in_book, "_build/html/plain.html"), read_site),
+    ],
+    "bits without a seal": [
+        flips("`claims.yml`", partial(copied, "claims.yml", "claims.yml"), read_all_claims),
+    ],
+    "hostile files": [("made to do harm", "files of all kinds", 20, hostile)],
+}
