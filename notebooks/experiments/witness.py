@@ -51,6 +51,7 @@ FLIPS = {
     "train_error": 0.005,
     "validation_error": 0.005,
     "test_error": 0.005,
+    "after": 2000.0,  # of returns over ten doors, after an update: one that stays shut
 }
 SHOWN = ("method", "iteration", "frames", "update", "run", "domain", "door", "metric")
 
