@@ -1,0 +1,172 @@
+"""Rules for tables and comparisons of any chapter: their numbers, which arm is better, and why."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import scipy.stats
+
+from rules.cells import Cells, label, paper_effect, paper_tests, published
+from rules.verdicts import (
+    EXPLAINED,
+    IN_PART,
+    REPRODUCED,
+    UNDECIDED,
+    Compared,
+    Finding,
+    compare,
+    counted,
+    holds,
+    holm,
+    together,
+)
+
+
+def means_come_back(
+    cells: Cells,
+    paper: pd.DataFrame,
+    metric: str,
+    num_paper_runs: int,
+    digits: int,
+    num_errors: float,
+    where: dict[str, dict],
+) -> Finding:
+    """Every mean of the paper is as near to ours as the spread of its runs lets us expect.
+
+    Within ``num_errors`` standard errors of the difference, or within the rounding of what is
+    printed. ``where`` says which rows of a method are meant.
+    """
+    good, parts = [], []
+    for cell, mean, std in published(paper):
+        ours = cells.runs(metric=metric, **cell, **where[cell["method"]])
+        error = np.hypot(std / np.sqrt(num_paper_runs), ours.sem())
+        good.append(abs(ours.mean() - mean) <= max(num_errors * error, 0.5 * 10**-digits))
+        name = f"{label(cell['method'])} on {cell['domain']}"
+        parts.append(f"{name} {ours.mean():.3f} (paper {mean:.{digits}f})")
+    counts = f"{sum(good)} of {len(good)} come back: "
+    return Finding(together(map(holds, good)), counts + "; ".join(parts))
+
+
+def spreads_come_back(
+    cells: Cells,
+    paper: pd.DataFrame,
+    metric: str,
+    num_paper_runs: int,
+    ddof: int,
+    common: dict[str, Any],
+    where: dict[str, dict],
+) -> Finding:
+    """No standard deviation of the paper differs from ours by the F test at 5 %, by Holm's method.
+
+    ``ddof`` is how the paper's are read: 0, the deviation of its runs; 1, the estimate of that of
+    all runs there could be.
+    """
+    ratios, p = [], []
+    for cell, _, std in published(paper[paper["std"].notna()]):
+        ours = cells.runs(metric=metric, **common, **cell, **where.get(cell["method"], {}))
+        theirs = std * np.sqrt(num_paper_runs / (num_paper_runs - 1)) if ddof == 0 else std
+        ratios.append(ours.std(ddof=1) / theirs)
+        smaller = scipy.stats.f.cdf(ratios[-1] ** 2, len(ours) - 1, num_paper_runs - 1)
+        p.append(2 * min(smaller, 1 - smaller))
+    same = [adjusted >= 0.05 for adjusted in holm(p)]
+    return Finding(
+        together(map(holds, same)),
+        f"{sum(same)} of {len(same)} do not differ beyond chance; ours are {min(ratios):.2f} to "
+        f"{max(ratios):.2f} times the paper's, in the middle {np.median(ratios):.2f}",
+    )
+
+
+def better(
+    cells: Cells,
+    paper: pd.DataFrame,
+    metric: str,
+    domains: list,
+    over: str,
+    paired: bool,
+    num_paper_runs: int,
+    comparisons: dict[str, list[dict]],
+) -> Finding:
+    """One arm has a higher value than another, in every comparison of two.
+
+    Of a run, the ``mean`` or the worst value (``min``) over the domains counts.
+    """
+    verdicts, parts = [], []
+    for name, (method, baseline) in comparisons.items():
+        ours, theirs = (
+            cells.over(domains, over, metric=metric, **arm) for arm in (method, baseline)
+        )
+        effect = paper_effect(paper, method["method"], baseline["method"], domains, over)
+        found = compare(ours, theirs, effect, paired)
+        verdicts.append(found.verdict)
+        parts.append(f"{name}: {ours.mean():.3f} and {theirs.mean():.3f}, {found.text()}")
+    if effect is not None:
+        chosen = paper[paper["domain"].isin(map(str, domains))]
+        parts.append(paper_tests(chosen, method["method"], baseline["method"], num_paper_runs))
+    return Finding(together(verdicts), "; ".join(parts))
+
+
+def because_of_the_game(
+    cells: Cells,
+    paper: pd.DataFrame,
+    common: dict[str, Any],
+    places: list[dict[str, Any]],
+    method: dict[str, Any],
+    baseline: dict[str, Any],
+    control: list[dict[str, Any]],
+    lower_is_better: bool,
+    share: float,
+) -> Finding:
+    """What a control leaves of the method's advantage over its baseline, in every place.
+
+    What is left is the difference of two arms: the method and a control without the game, or the
+    method and its baseline where both are controlled for something else.
+
+        explained otherwise   its 95 % interval ends below ``share`` of the advantage
+        reproduced            it begins above 1 - ``share`` of it
+        reproduced in part    it lies above zero, but neither
+        undecided             it does not
+
+    Where there is no advantage, there is nothing to explain, and the verdict is that on it.
+    """
+    verdicts, parts = [], []
+    for place in places:
+        arms = [{**common, **place, **arm} for arm in (method, baseline, *control)]
+        values = [cells.runs(**arm) * (-1 if lower_is_better else 1) for arm in arms]
+        effect = None
+        if "domain" in place:
+            domains = [place["domain"]]
+            effect = paper_effect(paper, method["method"], baseline["method"], domains)
+        advantage, left = compare(*values[:2], effect), compare(*values[2:])
+        verdicts.append(remaining(advantage, left, share))
+        where = ", ".join(
+            f"{column.removeprefix('num_').replace('_', ' ')} {value}"
+            for column, value in place.items()
+        )
+        parts.append(f"{where}: the advantage is {advantage.text()}, what is left {left.text()}")
+    compared = [f"{label(arm['method'])}{suffix(arm)}" for arm in (method, baseline, *control)]
+    return Finding(
+        together(verdicts),
+        f"{counted(verdicts)}. The advantage is that of {compared[0]} over {compared[1]}; what is "
+        f"left that of {compared[2]} over {compared[3]}. " + "; ".join(parts),
+    )
+
+
+def remaining(advantage: Compared, left: Compared, share: float) -> str:
+    """The verdict on a cause of an advantage, by what is left of it without that cause."""
+    low, high = left.difference.low, left.difference.high
+    gained = advantage.difference.mean
+    if advantage.difference.low <= 0:
+        return advantage.verdict
+    if high < share * gained:
+        return EXPLAINED
+    if low > (1 - share) * gained:
+        return REPRODUCED
+    return IN_PART if low > 0 else UNDECIDED
+
+
+def suffix(arm: dict[str, Any]) -> str:
+    """What an arm has besides its method."""
+    words = [str(value) for column, value in arm.items() if column != "method"]
+    return f" ({', '.join(words)})" if words else ""
