@@ -199,11 +199,12 @@ def full_list(book: dict, findings: dict[str, Finding]) -> str:
 
 
 def sensitivity(finding: Finding) -> str:
-    """What the verdict becomes with other choices, as a table."""
+    """What the verdict becomes with other choices, as a table; evidence only where it differs."""
     if not finding.variants:
         return ""
     lines = [
-        f"| {name} | {badge(own.verdict, own.verdict)} | {own.evidence} |"
+        f"| {name} | {badge(own.verdict, own.verdict)} | "
+        f"{'as above' if own.evidence == finding.evidence else own.evidence} |"
         for name, own in finding.variants.items()
     ]
     head = "| With another choice | Verdict | We find |\n|:--|:--|:--|\n"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 
+from experiments.tables import chosen_by
 from rules.cells import Cells, NoData, label
 from rules.keys import narrower
 from rules.verdicts import (
@@ -67,8 +68,6 @@ def pairs(
     cells: Cells, game: str, baseline: str, metrics: dict[str, list[str]], criterion: str
 ) -> list[tuple[str, pd.Series, pd.Series]]:
     """Test errors of both by problem; each run with the penalty that has the lowest criterion."""
-    from experiments.causality import chosen_by  # takes seconds, since it brings torch
-
     chosen = Cells(chosen_by(cells.rows, criterion), cells.num_runs)
     return [
         (

@@ -11,7 +11,7 @@ from experiments.chapter import Chapter
 from experiments.experiment import rebuilt
 from experiments.origin import ROOT
 from experiments.store import Store
-from experiments.tables import by_method, largest_differences
+from experiments.tables import by_method, chosen_by, largest_differences
 from ipo.causality.predictors import Regression
 from ipo.causality.scm import SCM, Linear, moments
 
@@ -57,7 +57,7 @@ def test_each_run_chooses_its_penalty_by_itself():
         ("FOU", "vrex", 1, 1.0, "error", 7.0), ("FOU", "vrex", 1, 10.0, "error", 8.0),
         ("FOU", "erm", 0, 0.0, "score", 9.0), ("FOU", "erm", 0, 0.0, "error", 9.0),
     )  # fmt: skip
-    chosen = causality.chosen_by(rows, "score")
+    chosen = chosen_by(rows, "score")
     errors = chosen[chosen["metric"] == "error"].set_index(["method", "run"])["value"]
     assert errors.to_dict() == {("vrex", 0): 6.0, ("vrex", 1): 7.0, ("erm", 0): 9.0}
 
@@ -68,7 +68,7 @@ def test_a_tie_goes_to_the_first_penalty():
         ("FOU", "vrex", 0, 1.0, "score", 2.0),
         ("FOU", "vrex", 0, 10.0, "score", 2.0),
     )
-    assert list(causality.chosen_by(rows, "score")["penalty"]) == [1.0]
+    assert list(chosen_by(rows, "score")["penalty"]) == [1.0]
 
 
 def test_not_chosen_is_one_penalty_of_the_penalised_methods_only():
