@@ -71,10 +71,12 @@ def spreads_come_back(
         smaller = scipy.stats.f.cdf(ratios[-1] ** 2, len(ours) - 1, num_paper_runs - 1)
         p.append(2 * min(smaller, 1 - smaller))
     same = [adjusted >= 0.05 for adjusted in holm(p)]
+    near = sum(0.9 <= ratio <= 1.1 for ratio in ratios)
     return Finding(
         together(map(holds, same)),
         f"{sum(same)} of {len(same)} do not differ beyond chance; ours are {min(ratios):.2f} to "
-        f"{max(ratios):.2f} times the paper's, in the middle {np.median(ratios):.2f}",
+        f"{max(ratios):.2f} times the paper's, in the middle {np.median(ratios):.2f}, and {near} "
+        "are within a tenth of it",
     )
 
 
@@ -112,13 +114,14 @@ def because_of_the_game(
     paper: pd.DataFrame,
     common: dict[str, Any],
     places: list[dict[str, Any]],
+    each: bool,
     method: dict[str, Any],
     baseline: dict[str, Any],
     control: list[dict[str, Any]],
     lower_is_better: bool,
     share: float,
 ) -> Finding:
-    """What a control leaves of the method's advantage over its baseline, in every place.
+    """What a control leaves of the method's advantage over its baseline.
 
     What is left is the difference of two arms: the method and a control without the game, or the
     method and its baseline where both are controlled for something else.
@@ -128,29 +131,52 @@ def because_of_the_game(
         reproduced in part    it lies above zero, but neither
         undecided             it does not
 
-    Where there is no advantage, there is nothing to explain, and the verdict is that on it.
+    Where there is no advantage, there is nothing to explain, and the verdict is that on it. Of a
+    run, the mean over the places counts, or, where ``each`` is asked for, every place by itself.
     """
-    verdicts, parts = [], []
-    for place in places:
-        arms = [{**common, **place, **arm} for arm in (method, baseline, *control)]
-        values = [cells.runs(**arm) * (-1 if lower_is_better else 1) for arm in arms]
-        effect = None
-        if "domain" in place:
-            domains = [place["domain"]]
-            effect = paper_effect(paper, method["method"], baseline["method"], domains)
-        advantage, left = compare(*values[:2], effect), compare(*values[2:])
-        verdicts.append(remaining(advantage, left, share))
-        where = ", ".join(
-            f"{column.removeprefix('num_').replace('_', ' ')} {value}"
-            for column, value in place.items()
+    compared = [
+        advantage_and_left(
+            cells, paper, common, group, [method, baseline, *control], lower_is_better
         )
-        parts.append(f"{where}: the advantage is {advantage.text()}, what is left {left.text()}")
-    compared = [f"{label(arm['method'])}{suffix(arm)}" for arm in (method, baseline, *control)]
+        for group in ([[place] for place in places] if each else [places])
+    ]
+    verdicts = [remaining(*own, share) for own in compared]
+    names = [f"{label(arm['method'])}{suffix(arm)}" for arm in (method, baseline, *control)]
+    parts = [
+        f"the advantage is {advantage.text()}, what is left {left.text()}"
+        for advantage, left in compared
+    ]
+    if each:
+        parts = [f"{words(place)}: {part}" for place, part in zip(places, parts, strict=True)]
+        parts[0] = f"{counted(verdicts)}: {parts[0]}"
+    elif len(places) > 1:
+        parts[0] = f"in the mean over {len(places)} configurations {parts[0]}"
     return Finding(
         together(verdicts),
-        f"{counted(verdicts)}. The advantage is that of {compared[0]} over {compared[1]}; what is "
-        f"left that of {compared[2]} over {compared[3]}. " + "; ".join(parts),
+        f"of {names[0]} over {names[1]} (what is left, of {names[2]} over {names[3]}) "
+        + "; ".join(parts),
     )
+
+
+def advantage_and_left(
+    cells: Cells,
+    paper: pd.DataFrame,
+    common: dict[str, Any],
+    places: list[dict[str, Any]],
+    arms: list[dict[str, Any]],
+    lower_is_better: bool,
+) -> tuple[Compared, Compared]:
+    """The difference of the first two arms, beside the paper's, and that of the last two."""
+    sign = -1 if lower_is_better else 1
+    values = [
+        sign * sum(cells.runs(**common, **place, **arm) for place in places) / len(places)
+        for arm in arms
+    ]
+    effect = None
+    if all("domain" in place for place in places):
+        domains = [place["domain"] for place in places]
+        effect = paper_effect(paper, arms[0]["method"], arms[1]["method"], domains)
+    return compare(*values[:2], effect), compare(*values[2:])
 
 
 def remaining(advantage: Compared, left: Compared, share: float) -> str:
@@ -168,5 +194,13 @@ def remaining(advantage: Compared, left: Compared, share: float) -> str:
 
 def suffix(arm: dict[str, Any]) -> str:
     """What an arm has besides its method."""
-    words = [str(value) for column, value in arm.items() if column != "method"]
-    return f" ({', '.join(words)})" if words else ""
+    others = [str(value) for column, value in arm.items() if column != "method"]
+    return f" ({', '.join(others)})" if others else ""
+
+
+def words(place: dict[str, Any]) -> str:
+    """A place by its columns."""
+    return ", ".join(
+        f"{column.removeprefix('num_').replace('_', ' ')} {value}"
+        for column, value in place.items()
+    )

@@ -133,6 +133,7 @@ def cells_of(values: dict[tuple[str, ...], np.ndarray], columns: list[str]) -> C
 SETTINGS = {
     "common": {},
     "places": [{"domain": "blue"}],  # which the paper does not have
+    "each": False,
     "method": {"method": "ipo"},
     "baseline": {"method": "ppo"},
     "control": [{"method": "ipo"}, {"method": "ensemble"}],
