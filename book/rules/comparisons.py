@@ -141,21 +141,20 @@ def because_of_the_game(
         for group in ([[place] for place in places] if each else [places])
     ]
     verdicts = [remaining(*own, share) for own in compared]
-    names = [f"{label(arm['method'])}{suffix(arm)}" for arm in (method, baseline, *control)]
+    ours, theirs, controlled, left_over = (
+        f"{label(arm['method'])}{suffix(arm)}" for arm in (method, baseline, *control)
+    )
     parts = [
-        f"the advantage is {advantage.text()}, what is left {left.text()}"
+        f"{ours} is better than {theirs} by {advantage.text()}, and, what is left of it, "
+        f"{controlled} than {left_over} by {left.text()}"
         for advantage, left in compared
     ]
     if each:
         parts = [f"{words(place)}: {part}" for place, part in zip(places, parts, strict=True)]
-        parts[0] = f"{counted(verdicts)}: {parts[0]}"
+        parts[0] = f"{counted(verdicts)}; {parts[0]}"
     elif len(places) > 1:
         parts[0] = f"in the mean over {len(places)} configurations {parts[0]}"
-    return Finding(
-        together(verdicts),
-        f"of {names[0]} over {names[1]} (what is left, of {names[2]} over {names[3]}) "
-        + "; ".join(parts),
-    )
+    return Finding(together(verdicts), "; ".join(parts))
 
 
 def advantage_and_left(

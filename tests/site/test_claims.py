@@ -182,6 +182,66 @@ def test_a_difference_within_the_noise_is_not_significant(data):
     assert verdict(data, "lqr-better-than-both-baselines") == claims.UNDECIDED
 
 
+def moved(data: Path, method: str, by: float, of: str = "every cell") -> None:
+    """A method costs what fixed Φ does, and with two domains or everywhere so much more."""
+
+    def change(table):
+        fixed = table[table.method == "ipo_fixed_phi"].set_index([*COLUMNS[1:3], "run"])["value"]
+        chosen = table.method == method
+        cells = pd.MultiIndex.from_frame(table.loc[chosen, [*COLUMNS[1:3], "run"]])
+        wiggle = 0.01 * table.loc[chosen, "run"].to_numpy()
+        table.loc[chosen, "value"] = fixed.loc[cells].to_numpy() + wiggle
+        moves = chosen if of == "every cell" else chosen & (table.num_domains == 2)
+        table.loc[moves, "value"] += by
+        return table
+
+    edit(data, "lqr/tables", change)
+
+
+@pytest.mark.parametrize(
+    ("by", "of", "similar", "no_benefit"),
+    [
+        (0.0, "every cell", claims.REPRODUCED, claims.REPRODUCED),
+        (-30.0, "one cell", claims.IN_PART, claims.IN_PART),
+        (-30.0, "every cell", claims.CONTRADICTED, claims.CONTRADICTED),
+        (30.0, "every cell", claims.CONTRADICTED, claims.REPRODUCED),
+    ],
+)
+def test_updating_the_representation_changes_something_or_not(data, by, of, similar, no_benefit):
+    moved(data, "ipo_variable_phi", by, of)
+    assert verdict(data, "lqr-similar") == similar
+    assert verdict(data, "lqr-no-benefit") == no_benefit
+
+
+@pytest.mark.parametrize(
+    ("by", "of", "expected"),
+    [
+        (-5.0, "every cell", claims.REPRODUCED),
+        (-5.0, "one cell", claims.IN_PART),
+        (5.0, "every cell", claims.CONTRADICTED),
+    ],
+)
+def test_a_strong_baseline_or_not(data, by, of, expected):
+    moved(data, "gradient_descent", 0.0)
+    moved(data, "overparameterized", by, of)
+    assert verdict(data, "lqr-overparameterized") == expected
+
+
+@pytest.mark.parametrize(
+    ("shift", "expected"),
+    [(-5.0, claims.REPRODUCED), (0.0, claims.UNDECIDED), (5.0, claims.CONTRADICTED)],
+)
+def test_gradient_descent_overfits_or_not(data, shift, expected):
+    def with_training(table):
+        chosen = table[table.method == "gradient_descent"]
+        value = chosen["value"] + shift + np.where(chosen["run"] % 2, 0.1, -0.1)
+        trained = chosen.assign(domain="train", metric="train_cost", value=value)
+        return pd.concat([table, trained], ignore_index=True)
+
+    edit(data, "lqr/tables", with_training)
+    assert verdict(data, "lqr-overfits") == expected
+
+
 @pytest.mark.parametrize(
     ("at_20", "at_50", "expected"),
     [
@@ -339,6 +399,25 @@ def test_higher_return_or_not(empty, ipo, ensemble, better, game):
     )
     assert verdict(empty, "keys-better") == better
     assert verdict(empty, "keys-because-of-the-game") == game
+
+
+@pytest.mark.parametrize(
+    ("grey", "expected"),
+    [(0.79, claims.REPRODUCED), (0.9, claims.IN_PART), (0.97, claims.CONTRADICTED)],
+)
+def test_standard_training_degrades_or_not(empty, grey, expected):
+    write_keys(empty, training_colors(0.94) | {("ppo", "grey"): (grey, 0.01)})
+    assert verdict(empty, "keys-degrades") == expected
+
+
+@pytest.mark.parametrize(
+    ("ipo", "expected"),
+    [(0.90, claims.REPRODUCED), (0.80, claims.CONTRADICTED)],
+)
+def test_better_in_the_worst_colour_or_not(empty, ipo, expected):
+    worst = {("ppo", "grey"): (0.80, 0.1), ("ipo", "grey"): (ipo, 0.101)}
+    write_keys(empty, training_colors(0.94) | worst)
+    assert verdict(empty, "keys-worst") == expected
 
 
 @pytest.mark.parametrize(

@@ -205,6 +205,27 @@ def test_a_game_is_as_good_as_the_penalty_or_not(shift, expected):
 
 
 @pytest.mark.parametrize(
+    ("scale", "expected"), [(0.1, REPRODUCED), (1.0, UNDECIDED), (10.0, CONTRADICTED)]
+)
+def test_a_game_varies_less_or_not(scale, expected):
+    noise = np.tile(NOISE, 6)
+    values = {
+        (method, "test", "error"): runs
+        for method, runs in (("game", scale * noise), ("irmv1", noise[::-1]))
+    } | {(method, "train", "criterion"): 0 * noise for method in ("game", "irmv1")}
+    cells = cells_of(values, ["method", "domain", "metric"])
+    cells.rows[["problem", "penalty"]] = "digits", 0.0
+    settings = {
+        "game": "game",
+        "baseline": "irmv1",
+        "metrics": {"error": ["digits"]},
+        "criterion": "criterion",
+    }
+    found = RULES["game_varies_less"](cells, pd.DataFrame(), **settings)
+    assert found.verdict == expected
+
+
+@pytest.mark.parametrize(
     ("gain", "residual", "expected"),
     [(1.0, 0.0, REPRODUCED), (0.0, 0.0, CONTRADICTED), (1.0, 1.0, NO_DATA)],
 )
