@@ -94,19 +94,20 @@ def better(
 
     Of a run, the ``mean`` or the worst value (``min``) over the domains counts.
     """
-    verdicts, parts = [], []
+    verdicts, parts, theirs_tested = [], [], []
+    tested = paper[paper["domain"].isin(map(str, domains))]
     for name, (method, baseline) in comparisons.items():
         ours, theirs = (
             cells.over(domains, over, metric=metric, **arm) for arm in (method, baseline)
         )
-        effect = paper_effect(paper, method["method"], baseline["method"], domains, over)
+        methods = method["method"], baseline["method"]
+        effect = paper_effect(paper, *methods, domains, over)
+        if effect is not None:
+            theirs_tested.append(paper_tests(tested, *methods, num_paper_runs))
         found = compare(ours, theirs, effect, paired)
         verdicts.append(found.verdict)
         parts.append(f"{name}: {ours.mean():.3f} and {theirs.mean():.3f}, {found.text()}")
-    if effect is not None:
-        chosen = paper[paper["domain"].isin(map(str, domains))]
-        parts.append(paper_tests(chosen, method["method"], baseline["method"], num_paper_runs))
-    return Finding(together(verdicts), "; ".join(parts))
+    return Finding(together(verdicts), "; ".join(dict.fromkeys(parts + theirs_tested)))
 
 
 def because_of_the_game(

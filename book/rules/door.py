@@ -136,7 +136,8 @@ def matched_on_doors(doors: pd.DataFrame, unit: list[str]) -> Finding:
     low, high = effect + np.array([-1, 1]) * scipy.stats.t.ppf(0.975, num - 1) * error
     evidence = (
         f"at {both['door'].nunique()} doors that are opened in both ways, policies that hook open "
-        f"more by {effect:+.3f}, 95 % interval [{low:+.3f}, {high:+.3f}], over {num} units"
+        f"more by {effect:+.3f}, 95 % interval [{low:+.3f}, {high:+.3f}], over {num} "
+        f"{'seeds' if unit == ['run'] else 'trainings'}"
     )
     return Finding(verdict(low, high), evidence)
 
