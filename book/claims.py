@@ -192,7 +192,8 @@ def full_list(book: dict, findings: dict[str, Finding]) -> str:
                 f"*The paper claims* ({claim['where']}): {claim['claim']}\n\n"
                 f"*We test:* {claim['test']}\n\n"
                 f"*We find:* {finding.evidence}.\n\n"
-                f"{sensitivity(finding)}"
+                + (f"*The paper's own table:* {finding.theirs}.\n\n" if finding.theirs else "")
+                + f"{sensitivity(finding)}"
                 f"*Decided by* `{claim['rule']}` *from* {sources or 'no rows'}.\n"
             )
     return "\n".join(parts)
@@ -215,6 +216,8 @@ def main() -> None:
     book = read_claims()
     for name, finding in decide_all(book, read_results(book)).items():
         print(f"{name}: {finding.verdict}\n    {finding.evidence}")
+        if finding.theirs:
+            print(f"    the paper's own table: {finding.theirs}")
         for choice, own in finding.variants.items():
             print(f"    {choice}: {own.verdict}\n        {own.evidence}")
 

@@ -114,10 +114,7 @@ def paper_tests(paper: pd.DataFrame, method: str, baseline: str, num_runs: int) 
         ).pvalue
         for scale in (np.sqrt(num_runs / (num_runs - 1)), 1.0)
     )
-    return (
-        f"the paper's own table, by Welch's test: p = {span(zero)} where its ± has ddof 0, "
-        f"{span(one)} where it has 1"
-    )
+    return f"by Welch's test p = {span(zero)} where its ± has ddof 0, {span(one)} where it has 1"
 
 
 def span(values: np.ndarray) -> str:

@@ -94,7 +94,7 @@ def better(
 
     Of a run, the ``mean`` or the worst value (``min``) over the domains counts.
     """
-    verdicts, parts, theirs_tested = [], [], []
+    verdicts, parts, tests = [], [], []
     tested = paper[paper["domain"].isin(map(str, domains))]
     for name, (method, baseline) in comparisons.items():
         ours, theirs = (
@@ -103,11 +103,11 @@ def better(
         methods = method["method"], baseline["method"]
         effect = paper_effect(paper, *methods, domains, over)
         if effect is not None:
-            theirs_tested.append(paper_tests(tested, *methods, num_paper_runs))
+            tests.append(paper_tests(tested, *methods, num_paper_runs))
         found = compare(ours, theirs, effect, paired)
         verdicts.append(found.verdict)
         parts.append(f"{name}: {ours.mean():.3f} and {theirs.mean():.3f}, {found.text()}")
-    return Finding(together(verdicts), "; ".join(dict.fromkeys(parts + theirs_tested)))
+    return Finding(together(verdicts), "; ".join(parts), "; ".join(dict.fromkeys(tests)))
 
 
 def because_of_the_game(

@@ -21,10 +21,16 @@ NO_DATA = "no data yet"
 
 @dataclass(frozen=True)
 class Finding:
-    """A verdict, what it rests on, and the findings that other choices of the rule lead to."""
+    """A verdict and what it rests on.
+
+    Attributes:
+        theirs: what the paper's own numbers say by the same question, if they can be tested.
+        variants: the findings that other choices of the rule's settings lead to.
+    """
 
     verdict: str
     evidence: str
+    theirs: str = ""
     variants: dict[str, Finding] = field(default_factory=dict)
 
 

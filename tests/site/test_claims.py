@@ -323,6 +323,7 @@ def test_the_page_of_claims_has_every_claim(data, tmp_path):
     for claim in claims.read_claims(data)["claims"]:
         assert f"({claim['id']})=" in page
         assert claim["where"] in page
+        assert f"*Decided by* `{claim['rule']}`" in page
         for choice in claim.get("variants", {}):
             assert f"| {choice} | {{bdg-" in page
 
