@@ -41,7 +41,7 @@ def build_site(root: Path, build: Path, notebooks: list[Notebook], profile: str)
 def stage(root: Path, source: Path, notebooks: list[Notebook], profile: str) -> None:
     """Put all that enters the site into one folder: prose, executed notebooks, generated pages."""
     shutil.rmtree(source, ignore_errors=True)
-    others = shutil.ignore_patterns("_build", "_executed", "__pycache__", "*.py", "locks")
+    others = shutil.ignore_patterns("_build", "_executed", "__pycache__", "*.py", "locks", "rules")
     shutil.copytree(root / "book", source, ignore=others)
     for name in ("_config.yml", "_toc.yml", "environment.txt"):
         shutil.copy(root / name, source)

@@ -81,9 +81,9 @@ def power(effect: Finite, spread: Positive, num_runs: Count) -> float:
     if degrees < 1:
         raise ValueError(f"num_runs = {num_runs}: must be at least 2")
     critical = scipy.stats.t.ppf(0.975, degrees)
-    shift = effect / spread * np.sqrt(num_runs)
-    found = scipy.stats.nct(degrees, shift)
-    return float(found.sf(critical) + found.cdf(-critical))
+    found = scipy.stats.nct(degrees, abs(effect) / spread * np.sqrt(num_runs))
+    # The tail on the other side comes as NaN where it is too small to be computed.
+    return float(found.sf(critical) + np.nan_to_num(found.cdf(-critical)))
 
 
 @checked

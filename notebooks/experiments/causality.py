@@ -416,14 +416,6 @@ def failure_cells(levels: Mapping[str, Sequence[float]], num_iterations: int) ->
 # ----------------------------------------------- which rows a table shows, and under which name
 
 
-def chosen_by(rows: pd.DataFrame, criterion: str) -> pd.DataFrame:
-    """The rows of the penalty with the lowest ``criterion``: each run chooses by itself."""
-    keys = ["problem", "method", "run"]
-    scores = rows[rows["metric"] == criterion].sort_values("value", kind="stable")
-    best = scores.drop_duplicates(keys)[[*keys, "penalty"]]
-    return rows.merge(best, on=[*keys, "penalty"])
-
-
 def not_chosen(rows: pd.DataFrame, penalty: float) -> pd.DataFrame:
     """IRMv1 and V-REx with one given penalty, as methods ``irmv1_strong`` and ``vrex_strong``."""
     fixed = rows[rows["method"].isin(["irmv1", "vrex"]) & (rows["penalty"] == penalty)]

@@ -136,3 +136,11 @@ def by_method(
     wide = groups.apply(mean_and_interval, digits=digits).unstack()
     present = [method for method in names if method in wide.index]
     return wide.reindex(present).rename(index=names).rename_axis("method")
+
+
+def chosen_by(rows: pd.DataFrame, criterion: str) -> pd.DataFrame:
+    """The rows of the penalty with the lowest ``criterion``: each run chooses by itself."""
+    keys = ["problem", "method", "run"]
+    scores = rows[rows["metric"] == criterion].sort_values("value", kind="stable")
+    best = scores.drop_duplicates(keys)[[*keys, "penalty"]]
+    return rows.merge(best, on=[*keys, "penalty"])

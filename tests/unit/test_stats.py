@@ -59,6 +59,10 @@ def test_power_without_an_effect_is_the_level():
     assert power(0.0, 2.0, 10) == pytest.approx(0.05)
 
 
+def test_a_large_effect_is_found_for_certain():
+    assert power(1.9, 1.0, 100) == pytest.approx(1)
+
+
 @pytest.mark.parametrize(("effect", "num_runs"), [(1.0, 5), (-0.7, 10), (0.3, 40)])
 def test_power_is_how_often_the_interval_leaves_zero_out(effect, num_runs):
     samples = np.random.default_rng(1).normal(effect, 1, size=(20_000, num_runs))

@@ -1,0 +1,248 @@
+"""The decision table of the verdicts, on rows made by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+import scipy.stats
+
+from rules import (
+    CONTRADICTED,
+    EXPLAINED,
+    IN_PART,
+    NO_DATA,
+    REPRODUCED,
+    RULES,
+    UNDECIDED,
+    Cells,
+    NoData,
+)
+from rules.cells import paper_effect, paper_tests
+from rules.verdicts import compare, decided, holm, together, verdict, within
+
+NOISE = np.array([-2.0, -1, 0, 1, 2])
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "effect", "expected"),
+    [
+        (1, 3, 2, REPRODUCED),
+        (1, 3, None, REPRODUCED),
+        (3, 4, 2, REPRODUCED),  # larger than in the paper
+        (1, 3, 4, IN_PART),  # there, but smaller
+        (-1, 3, 2, UNDECIDED),
+        (-1, 3, None, UNDECIDED),
+        (-1, 1, 2, CONTRADICTED),  # excludes the paper's effect
+        (-3, -1, 2, CONTRADICTED),
+        (-3, -1, None, CONTRADICTED),
+        (-3, 3, -1, UNDECIDED),  # the paper itself has the other sign
+    ],
+)
+def test_the_decision_table(low, high, effect, expected):
+    assert verdict(low, high, effect) == expected
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "expected"),
+    [(-1, 1, REPRODUCED), (-3, 1, UNDECIDED), (3, 4, CONTRADICTED), (-4, -3, CONTRADICTED)],
+)
+def test_an_interval_between_bounds(low, high, expected):
+    assert within(low, high, -2, 2) == expected
+
+
+@pytest.mark.parametrize(
+    ("verdicts", "expected"),
+    [
+        ([EXPLAINED, EXPLAINED], EXPLAINED),
+        ([REPRODUCED, CONTRADICTED], IN_PART),
+        ([IN_PART, UNDECIDED], IN_PART),
+        ([CONTRADICTED, UNDECIDED], UNDECIDED),
+        ([CONTRADICTED, CONTRADICTED], CONTRADICTED),
+    ],
+)
+def test_parts_of_a_claim(verdicts, expected):
+    assert together(verdicts) == expected
+
+
+def test_holm_beside_a_table_by_hand():
+    assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
+    assert holm([0.6, 0.7]) == [1, 1]
+
+
+def test_many_tests_take_a_stronger_difference_each():
+    base = pd.Series(np.zeros(5))
+    sure, weak = (compare(pd.Series(NOISE + shift), base) for shift in (5.0, 2.2))
+    assert weak.difference.p < 0.05 < 2 * weak.difference.p
+    assert decided([sure, weak, weak]) == [REPRODUCED, UNDECIDED, UNDECIDED]
+    assert decided([sure, weak, weak], corrected=False) == [REPRODUCED] * 3
+    assert decided([compare(base, pd.Series(NOISE + 5))]) == [CONTRADICTED]
+
+
+def test_pairs_are_compared_by_their_differences():
+    runs = pd.Series(10 * NOISE)
+    shifted = runs + 1 + 0.1 * pd.Series(NOISE[::-1])
+    assert compare(shifted, runs).verdict == REPRODUCED
+    unpaired = compare(shifted, runs, paired=False)
+    assert unpaired.verdict == UNDECIDED
+    expected = scipy.stats.ttest_ind(shifted, runs, equal_var=False).pvalue
+    assert unpaired.difference.p == pytest.approx(expected)
+
+
+def test_the_text_names_the_power_to_find_the_papers_effect():
+    found = compare(pd.Series(NOISE), pd.Series(np.zeros(5)), effect=0.5)
+    assert "the paper's difference is +0.5; the power to tell that from zero is 9%" in found.text()
+
+
+PAPER = pd.DataFrame(
+    {
+        "method": ["ppo", "ppo", "ipo", "ipo"],
+        "domain": ["red", "grey", "red", "grey"],
+        "mean": [0.94, 0.80, 0.94, 0.85],
+        "std": [0.004, 0.12, 0.003, 0.03],
+    }
+)
+
+
+def test_the_papers_effect_needs_both_arms_and_all_domains():
+    assert paper_effect(PAPER, "ipo", "ppo", ["grey"]) == pytest.approx(0.05)
+    assert paper_effect(PAPER, "ipo", "ppo", ["red", "grey"], "min") == pytest.approx(0.05)
+    assert paper_effect(PAPER, "ppo", "ipo", ["grey"], of="std") == pytest.approx(0.09)
+    assert paper_effect(PAPER, "ipo", "ppo", ["grey", "blue"]) is None
+    assert paper_effect(PAPER, "ipo", "ensemble", ["grey"]) is None
+
+
+def test_the_papers_own_table_as_a_test():
+    text = paper_tests(PAPER[PAPER["domain"] == "grey"], "ipo", "ppo", num_runs=10)
+    assert "p = 0.25 where its ± has ddof 0, 0.23 where it has 1" in text
+
+
+# ------------------------------------------------------------------------------- single rules
+
+
+def cells_of(values: dict[tuple[str, ...], np.ndarray], columns: list[str]) -> Cells:
+    """A cell for each tuple of ``columns``, with these runs."""
+    rows = [
+        dict(zip(columns, key, strict=True)) | {"run": run, "value": float(value)}
+        for key, runs in values.items()
+        for run, value in enumerate(runs)
+    ]
+    return Cells(pd.DataFrame(rows), num_runs=len(next(iter(values.values()))))
+
+
+SETTINGS = {
+    "common": {},
+    "places": [{"domain": "blue"}],  # which the paper does not have
+    "each": False,
+    "method": {"method": "ipo"},
+    "baseline": {"method": "ppo"},
+    "control": [{"method": "ipo"}, {"method": "ensemble"}],
+    "lower_is_better": False,
+    "share": 0.25,
+}
+
+
+@pytest.mark.parametrize(
+    ("ipo", "control", "expected"),
+    [
+        (10, 10, EXPLAINED),
+        (10, 12, EXPLAINED),
+        (10, 5, IN_PART),
+        (10, 0, REPRODUCED),
+        (0, 0, UNDECIDED),
+        (-10, 0, CONTRADICTED),
+    ],
+)
+def test_a_control_removes_the_advantage_or_not(ipo, control, expected):
+    means = {("ipo", "blue"): ipo, ("ppo", "blue"): 0, ("ensemble", "blue"): control}
+    noise = dict(zip(means, (0.1 * NOISE, 0.1 * NOISE[::-1], 0.02 * NOISE), strict=True))
+    cells = cells_of({key: mean + noise[key] for key, mean in means.items()}, ["method", "domain"])
+    assert RULES["because_of_the_game"](cells, PAPER, **SETTINGS).verdict == expected
+
+
+def test_noise_leaves_it_open_what_a_control_removes():
+    values = {("ipo", "blue"): 10 + NOISE, ("ppo", "blue"): NOISE, ("ensemble", "blue"): 6 * NOISE}
+    cells = cells_of(values | {("ensemble", "blue"): 5 + 6 * NOISE[::-1]}, ["method", "domain"])
+    assert RULES["because_of_the_game"](cells, PAPER, **SETTINGS).verdict == UNDECIDED
+
+
+@pytest.mark.parametrize(
+    ("scale", "expected"), [(1.0, REPRODUCED), (0.01, CONTRADICTED), (100.0, CONTRADICTED)]
+)
+def test_standard_deviations_come_back_or_not(scale, expected):
+    values = {
+        (row.method, row.domain, "return"): row.std * scale * np.tile(NOISE, 6)
+        for row in PAPER.itertuples()
+    }
+    cells = cells_of(values, ["method", "domain", "metric"])
+    settings = {"metric": "return", "num_paper_runs": 10, "ddof": 0, "common": {}, "where": {}}
+    assert RULES["spreads_come_back"](cells, PAPER, **settings).verdict == expected
+
+
+@pytest.mark.parametrize(
+    ("shift", "expected"), [(0, REPRODUCED), (8, UNDECIDED), (30, CONTRADICTED), (-30, REPRODUCED)]
+)
+def test_a_game_is_as_good_as_the_penalty_or_not(shift, expected):
+    keys = ["problem", "method", "penalty", "domain", "metric"]
+    chosen, other = ("irmv1", 1.0, "test", "error"), ("irmv1", 9.0, "test", "error")
+    values = {
+        ("digits", "game", 0.0, "test", "error"): 100 + shift + 2 * NOISE,
+        ("digits", *chosen): 100 + 0 * NOISE,
+        ("digits", *other): 1 + 0 * NOISE,  # better, but not by the criterion
+        ("digits", "irmv1", 1.0, "train", "criterion"): 0 * NOISE,
+        ("digits", "irmv1", 9.0, "train", "criterion"): 1 + 0 * NOISE,
+        ("digits", "game", 0.0, "train", "criterion"): 0 * NOISE,
+    }
+    settings = {
+        "game": "game",
+        "baseline": "irmv1",
+        "metrics": {"error": ["digits"]},
+        "criterion": "criterion",
+        "margin": 0.1,
+    }
+    found = RULES["game_beside"](cells_of(values, keys), pd.DataFrame(), **settings)
+    assert found.verdict == expected
+
+
+@pytest.mark.parametrize(
+    ("scale", "expected"), [(0.1, REPRODUCED), (1.0, UNDECIDED), (10.0, CONTRADICTED)]
+)
+def test_a_game_varies_less_or_not(scale, expected):
+    noise = np.tile(NOISE, 6)
+    values = {
+        (method, "test", "error"): runs
+        for method, runs in (("game", scale * noise), ("irmv1", noise[::-1]))
+    } | {(method, "train", "criterion"): 0 * noise for method in ("game", "irmv1")}
+    cells = cells_of(values, ["method", "domain", "metric"])
+    cells.rows[["problem", "penalty"]] = "digits", 0.0
+    settings = {
+        "game": "game",
+        "baseline": "irmv1",
+        "metrics": {"error": ["digits"]},
+        "criterion": "criterion",
+    }
+    found = RULES["game_varies_less"](cells, pd.DataFrame(), **settings)
+    assert found.verdict == expected
+
+
+@pytest.mark.parametrize(
+    ("gain", "residual", "expected"),
+    [(1.0, 0.0, REPRODUCED), (0.0, 0.0, CONTRADICTED), (1.0, 1.0, NO_DATA)],
+)
+def test_an_equilibrium_is_optimal_everywhere_or_not(gain, residual, expected):
+    values = {
+        ("bounded", "1 2", "k_1"): [gain],
+        ("bounded", "1 2", "k_2"): [gain],
+        ("bounded", "1 2", "residual"): [residual],
+    } | {("pooled", beta, k): [1.0] for beta in "12" for k in ("k_1", "k_2")}
+    cells = cells_of(values, ["method", "betas", "metric"])
+    settings = {"methods": ["bounded"], "settled": 1e-6, "tolerance": 0.01}
+
+    def rule() -> str:
+        return RULES["equilibria_are_invariant"](cells, pd.DataFrame(), **settings).verdict
+
+    if expected == NO_DATA:
+        with pytest.raises(NoData, match="equilibria of bounded: 0"):
+            rule()
+    else:
+        assert rule() == expected
