@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
+from functools import partial
 
 import pandas as pd
 
@@ -32,12 +33,22 @@ ARMS = {
 }
 
 
-def turn_cells(sizes: Iterable[tuple[int, int]], num_iterations: int) -> list[Cell]:
-    """The arms that are not in the paper's tables, for pairs of n_d and n_y."""
-    return [cell for size in sizes for cell in _arms(*size, num_iterations)]
+def turn_cells(
+    sizes: Iterable[tuple[int, int]], apart: Iterable[tuple[int, int]], num_iterations: int
+) -> list[Cell]:
+    """The arms that are not in the paper's tables, for pairs of n_d and n_y.
+
+    One controller that visits the domains in turn at all ``sizes``; arms that cost n_d times as
+    much, and players that move together, at those of ``apart``.
+    """
+    of = partial(arms, num_iterations=num_iterations)
+    single = [arm for size in sizes for arm in of(*size) if arm.label.startswith("in_turn")]
+    others = [arm for size in apart for arm in of(*size) if not arm.label.startswith("in_turn")]
+    return single + others
 
 
-def _arms(num_domains: int, dim_distractor: int, num_iterations: int) -> list[Cell]:
+def arms(num_domains: int, dim_distractor: int, num_iterations: int) -> list[Cell]:
+    """All of them in one configuration."""
     ipo = published_cell("ipo_fixed_phi", num_domains, dim_distractor, num_iterations)
 
     def arm(label: str, **changes: object) -> Cell:
@@ -46,11 +57,11 @@ def _arms(num_domains: int, dim_distractor: int, num_iterations: int) -> list[Ce
     steps = num_domains * num_iterations
     few = max(1, num_iterations // num_domains)
     return [
-        arm("gradient_descent_steps", method="gradient_descent", num_iterations=steps),
-        arm("ensemble", method="ensemble"),
-        arm("ipo_together", order="together"),
         arm("in_turn", method="in_turn"),
         arm("in_turn_short", method="in_turn", num_iterations=few),
+        arm("ipo_together", order="together"),
+        arm("gradient_descent_steps", method="gradient_descent", num_iterations=steps),
+        arm("ensemble", method="ensemble"),
     ]
 
 
@@ -70,13 +81,13 @@ def recovered(rows: pd.DataFrame) -> pd.DataFrame:
     """
     mean = _by_arm(rows).groupby(level=["num_domains", "dim_distractor"]).mean()
     gained = mean.rsub(mean["gradient_descent"], axis=0)
-    return gained.div(gained["ipo_fixed_phi"], axis=0)[list(ARMS)]
+    return gained.div(gained["ipo_fixed_phi"], axis=0).reindex(columns=list(ARMS))
 
 
 def shares_table(rows: pd.DataFrame) -> pd.DataFrame:
     """:func:`recovered`, and how much more one domain at a time costs than IPO, paired by run."""
     shares = recovered(rows).drop(columns=["gradient_descent", "ipo_fixed_phi"])
-    table = shares.round(2).rename(columns=ARMS)
+    table = shares.map("{:.2f}".format, na_action="ignore").fillna("").rename(columns=ARMS)
     table["one domain at a time − IPO, cost"] = [
         f"{found.mean:+.1f} [{found.low:+.1f}, {found.high:+.1f}]"
         for _, own in _by_arm(rows).groupby(level=["num_domains", "dim_distractor"])
