@@ -124,6 +124,7 @@ TURNS = {
     "in_turn": "one network, one domain at a time",
     "in_turn_lr1e-3": "one network, one domain at a time, PPO's learning rate",
 }
+ARMS = MAIN | TURNS
 LARGER = {
     "ppo": "PPO, 122,880 frames",
     "ipo": "IPO, 122,880 frames",
@@ -491,7 +492,7 @@ def comparison(rows: pd.DataFrame, pairs: Sequence[tuple[str, str]]) -> pd.DataF
         values, base = _on_grey(rows, method, baseline)
         mean, low, high, p = paired_difference(values, base)
         return {
-            "difference on grey": f"{MAIN[method]} − {MAIN[baseline]}",
+            "difference on grey": f"{ARMS[method]} − {ARMS[baseline]}",
             "mean": mean,
             "95 % interval": f"[{low:+.3f}, {high:+.3f}]",
             # The function is for costs, where less is better.
@@ -500,6 +501,25 @@ def comparison(rows: pd.DataFrame, pairs: Sequence[tuple[str, str]]) -> pd.DataF
         }
 
     return pd.DataFrame([row(*pair) for pair in pairs])
+
+
+def two_by_two(rows: pd.DataFrame) -> pd.DataFrame:
+    """Exact return on grey by the number of networks and what each learns from.
+
+    All four arms have IPO's learning rate. Mean ± standard deviation over runs.
+    """
+    arms = {"one network": ("ppo_lr5e-4", "in_turn"), "two, averaged": ("ensemble", "ipo")}
+    data = ("both colours at once", "one colour at a time")
+    return pd.DataFrame(
+        [
+            {"networks": networks}
+            | {
+                column: mean_and_std(runs_of(rows, method, TESTED), 3)
+                for column, method in zip(data, methods, strict=True)
+            }
+            for networks, methods in arms.items()
+        ]
+    )
 
 
 def _on_grey(rows: pd.DataFrame, *methods: str, metric: str = "return_exact") -> list[pd.Series]:

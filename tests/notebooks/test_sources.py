@@ -73,11 +73,9 @@ def test_every_profile_names_existing_notebooks(profile):
 # Modules that may read files, each with a check of what it finds, or of what comes from elsewhere.
 READERS = {
     "store",  # rows
-    "sealed",  # policies, check-points, tables
+    "sealed",  # policies, check-points, tables, and records: benchmarks and confirmations, too
     "files",  # what it has just written
     "paper",  # the paper's numbers
-    "chapter",  # what a benchmark wrote
-    "confirm",  # its own record
     "pictures",  # a film that was just made
 }
 READING = re.compile(
