@@ -223,7 +223,7 @@ def _lyapunov_pair(M: Tensor, C: Tensor) -> tuple[Tensor, Tensor]:
     Stops when the next terms are below rounding, which takes 4 to 10 doublings.
 
     Returns:
-        P, S ``[..., n, n]``. Where the series do not end, P is infinite and S is NaN: the cost
+        P, S ``[systems, n, n]``. Where the series do not end, P is infinite and S is NaN: the cost
         is infinite and has no gradient.
     """
     X = torch.cat([C, torch.eye(M.shape[-1], dtype=M.dtype).expand_as(C)])
@@ -232,11 +232,13 @@ def _lyapunov_pair(M: Tensor, C: Tensor) -> tuple[Tensor, Tensor]:
     for _ in range(MAX_DOUBLINGS):
         X = torch.baddbmm(X, torch.bmm(Y.mT, X), Y)
         Y = torch.bmm(Y, Y)
-        if float(torch.linalg.vector_norm(Y)) < negligible:  # of all systems together
-            return X.chunk(2)
+        size = float(torch.linalg.vector_norm(Y))  # of all systems together
+        if size < negligible:
+            break
     P, S = X.chunk(2)
-    endless = ~(torch.linalg.vector_norm(Y[: len(M)], dim=(-2, -1)) < negligible)
-    P[endless], S[endless] = math.inf, math.nan
+    if not size < negligible:
+        endless = ~(torch.linalg.vector_norm(Y[: len(M)], dim=(-2, -1)) < negligible)
+        P[endless], S[endless] = math.inf, math.nan
     return P, S
 
 
