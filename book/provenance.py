@@ -52,10 +52,12 @@ def full(chapter: str, name: str, batches: list[Batch]) -> str:
     found = [record[cell] for cell in titles if cell in record]
     if not found:
         return f"0 of {len(titles)} cells"
-    kinds = Counter(outcome["how"] for outcome in found)
-    counted = ", ".join(f"{count} {how}" for how, count in sorted(kinds.items()))
+    kinds = Counter((outcome["how"], outcome["machine"]) for outcome in found)
+    counted = ", ".join(
+        f"{count} {how} on {machine}" for (how, machine), count in sorted(kinds.items())
+    )
     return (
-        f"{len(found)} of {len(titles)} cells: {counted}, at "
+        f"{len(found)} of {len(titles)} cells: {counted}; at "
         f"{commits(outcome['commit'] for outcome in found)}"
     )
 

@@ -111,6 +111,7 @@ def check_checkpoints(checkpoints: Iterable[int], end: int) -> None:
 
 Count = Annotated[int, check_count]
 Natural = Annotated[int, partial(check_count, minimum=0)]
+Finite = Annotated[float, check_number]
 Positive = Annotated[float, partial(check_number, above=0)]
 NonNegative = Annotated[float, partial(check_number, least=0)]
 Probability = Annotated[float, partial(check_number, least=0, most=1)]

@@ -38,6 +38,12 @@ class Distribution(Protocol):
     def entropy(parameters: Tensor) -> Tensor:
         """H(pi( . | o)) in nats, ``[...]``."""
 
+    @staticmethod
+    def gradient(
+        parameters: Tensor, actions: Tensor, weights: Tensor, entropy_weight: float
+    ) -> Tensor:
+        """Of ``weights [...] log pi(a | o) + entropy_weight H`` in the parameters."""
+
 
 class Categorical:
     """A of a finite set; the parameters are its logits ``[..., A]``, an action is a number."""
@@ -61,6 +67,18 @@ class Categorical:
         log_probabilities = _log_softmax(parameters)
         return -(log_probabilities.exp() * log_probabilities).sum(-1)
 
+    @staticmethod
+    def gradient(
+        parameters: Tensor, actions: Tensor, weights: Tensor, entropy_weight: float
+    ) -> Tensor:
+        """d log pi(a) / d z_i = 1(i = a) - pi(i),   d H / d z_i = - pi(i) (log pi(i) + H)."""
+        log_probabilities = _log_softmax(parameters)
+        probabilities = log_probabilities.exp()
+        weights = weights.unsqueeze(-1)
+        entropy = -(probabilities * log_probabilities).sum(-1, keepdim=True)
+        gradient = -probabilities * (weights + entropy_weight * (log_probabilities + entropy))
+        return gradient.scatter_add_(-1, actions.unsqueeze(-1), weights)
+
 
 class Gaussian:
     """Independent normal numbers; the parameters are A means, then A standard deviations.
@@ -75,8 +93,8 @@ class Gaussian:
     @staticmethod
     def sample(parameters: Tensor, generators: Generators) -> Tensor:
         mean, deviation = parameters.chunk(2, -1)
-        noise = [generator.standard_normal(mean.shape[1:]) for generator in generators]
-        return mean + deviation * torch.tensor(np.stack(noise)).to(mean)
+        noise = np.array([generator.standard_normal(mean.shape[1:]) for generator in generators])
+        return mean + deviation * torch.from_numpy(noise).to(mean)
 
     @staticmethod
     def mode(parameters: Tensor) -> Tensor:
@@ -92,6 +110,17 @@ class Gaussian:
     def entropy(parameters: Tensor) -> Tensor:
         deviation = parameters.chunk(2, -1)[1]
         return (0.5 + deviation.log() + LOG_SQRT_TAU).sum(-1)
+
+    @staticmethod
+    def gradient(
+        parameters: Tensor, actions: Tensor, weights: Tensor, entropy_weight: float
+    ) -> Tensor:
+        """With z = (a - m) / s: dlog pi/dm = z / s,  dlog pi/ds = (z^2 - 1) / s,  dH/ds = 1 / s."""
+        mean, deviation = parameters.chunk(2, -1)
+        standard = (actions - mean) / deviation
+        weights = weights.unsqueeze(-1)
+        of_deviation = weights * (standard.square() - 1) + entropy_weight
+        return torch.cat([weights * standard, of_deviation], -1) / torch.cat([deviation] * 2, -1)
 
 
 def _log_softmax(logits: Tensor) -> Tensor:

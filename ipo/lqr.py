@@ -223,7 +223,7 @@ def _lyapunov_pair(M: Tensor, C: Tensor) -> tuple[Tensor, Tensor]:
     Stops when the next terms are below rounding, which takes 4 to 10 doublings.
 
     Returns:
-        P, S ``[systems, n, n]``. Where the series do not end, P is infinite and S is NaN: the cost
+        P, S ``[systems, n, n]``. Where a series does not end, P is infinite and S is NaN: the cost
         is infinite and has no gradient.
     """
     X = torch.cat([C, torch.eye(M.shape[-1], dtype=M.dtype).expand_as(C)])
@@ -232,13 +232,12 @@ def _lyapunov_pair(M: Tensor, C: Tensor) -> tuple[Tensor, Tensor]:
     for _ in range(MAX_DOUBLINGS):
         X = torch.baddbmm(X, torch.bmm(Y.mT, X), Y)
         Y = torch.bmm(Y, Y)
-        size = float(torch.linalg.vector_norm(Y))  # of all systems together
-        if size < negligible:
-            break
+        if float(torch.linalg.vector_norm(Y)) < negligible:  # of all systems together
+            P, S = X.chunk(2)
+            return P, S
     P, S = X.chunk(2)
-    if not size < negligible:
-        endless = ~(torch.linalg.vector_norm(Y[: len(M)], dim=(-2, -1)) < negligible)
-        P[endless], S[endless] = math.inf, math.nan
+    endless = ~(torch.linalg.vector_norm(Y[: len(M)], dim=(-2, -1)) < negligible)
+    P[endless], S[endless] = math.inf, math.nan
     return P, S
 
 

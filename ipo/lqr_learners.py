@@ -1,4 +1,4 @@
-"""The four methods of the paper's LQR tables, as one game with different players.
+"""The four methods of the paper's LQR tables, and two controls, as one game with different players.
 
 Each method is a few lines that say who moves and what it wants. All of them train many runs
 at once: every tensor has a leading run axis R, and runs never influence each other.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Annotated, Any
 
 import numpy as np
@@ -24,12 +25,13 @@ from ipo.checks import (
     checked,
     one_of,
 )
-from ipo.game import LinearPlayers, play_round
+from ipo.game import Cost, LinearPlayers, Order, play_round
 from ipo.lqr import LQR, Gains, feedback_costs, spectral_radius, split_domains, training_costs
 from ipo.optimizers import OPTIMIZERS, descend, make_optimizer
 
 LQR_METHODS = ("gradient_descent", "overparameterized", "ipo_fixed_phi", "ipo_variable_phi")
-Method = Annotated[str, one_of(LQR_METHODS)]
+LQR_CONTROLS = ("in_turn", "ensemble")
+Method = Annotated[str, one_of((*LQR_METHODS, *LQR_CONTROLS))]
 
 
 @checked
@@ -38,7 +40,7 @@ class LQRSettings:
     """How a method is trained. The defaults are the paper's, where it states them.
 
     Attributes:
-        method: one of ``LQR_METHODS``.
+        method: one of ``LQR_METHODS``, or of ``LQR_CONTROLS``.
         optimizer: ``adam`` (the published runs), ``plain`` (the paper's text) or ``lbfgs``.
         learning_rate: step size; the paper has 1e-3, and 5e-4 for IPO (Table 5).
         num_iterations: steps of the single player, or rounds of all players.
@@ -47,6 +49,7 @@ class LQRSettings:
         num_hidden: rows of Phi, or width of the overparameterised controller.
         phi_scale: standard deviation of the initial entries of Phi (not published).
         gain_scale: the same for the controllers behind Phi (not published).
+        order: of the players of ``ipo_fixed_phi``: ``in_turn`` (Algorithm 1) or ``together``.
     """
 
     method: Method
@@ -58,10 +61,11 @@ class LQRSettings:
     num_hidden: Count = 200
     phi_scale: NonNegative = 0.001
     gain_scale: NonNegative = 0.001
+    order: Order = "in_turn"
 
 
 @checked
-def published_lqr(method: Method) -> LQRSettings:
+def published_lqr(method: Annotated[str, one_of(LQR_METHODS)]) -> LQRSettings:
     """The settings behind Tables 1 and 2; for Phi the reading that comes closest (see the book)."""
     if method == "ipo_fixed_phi":
         return LQRSettings(method, learning_rate=5e-4)
@@ -113,8 +117,7 @@ def ipo_fixed_phi(
 ) -> Learner:
     """A player per domain, each with a whole controller; their average acts (Phi = identity)."""
     players = _players(settings, start, problem.num_domains)
-    observations = [W.contiguous() for W in problem.W_train.unbind(1)]  # twice as fast
-    costs = [lambda K, W=W: feedback_costs(K @ W, problem) for W in observations]
+    costs = _costs_of_domains(problem)
     return Learner(
         iterate=lambda: players.round(costs),
         gain=lambda: players.policy,
@@ -169,9 +172,38 @@ class _FeedbackBehindPhi(torch.autograd.Function):
         return torch.bmm(K.mT, torch.bmm(grad_F, W.mT)), None, None, None
 
 
+@checked
+def in_turn(
+    problem: LQR, settings: LQRSettings, start: Gains, seeds: Annotated[Seeds, "R"]
+) -> Learner:
+    """IPO without players: one controller, whose one optimiser visits the domains in turn."""
+    player = _players(settings, start, num_players=1)
+    costs = _costs_of_domains(problem)
+    return Learner(
+        iterate=lambda: play_round(len(costs), lambda d: player.round([costs[d]])),
+        gain=lambda: player.policy,
+    )
+
+
+@checked
+def ensemble(
+    problem: LQR, settings: LQRSettings, start: Gains, seeds: Annotated[Seeds, "R"]
+) -> Learner:
+    """IPO without its domains: as many players, each of which moves on the pooled cost."""
+    players = _players(settings, start, problem.num_domains)
+    costs = [lambda K: _pooled_cost(K, problem)] * problem.num_domains
+    return Learner(
+        iterate=lambda: players.round(costs),
+        gain=lambda: players.policy,
+    )
+
+
 LEARNERS = {
     method.__name__: method
-    for method in (gradient_descent, overparameterized, ipo_fixed_phi, ipo_variable_phi)
+    for method in (
+        *(gradient_descent, overparameterized, ipo_fixed_phi, ipo_variable_phi),
+        *(in_turn, ensemble),
+    )
 }
 
 
@@ -226,12 +258,23 @@ def _pooled_cost(K: Tensor, problem: LQR) -> Tensor:
     return feedback_costs(F, problem).mean(1)
 
 
+def _costs_of_domains(problem: LQR) -> list[Cost]:
+    """Of the controller ``[R, n_u, n_o]`` that acts, one for each training domain."""
+
+    def cost(K: Tensor, W: Tensor) -> Tensor:
+        return feedback_costs(K @ W, problem)
+
+    # One block for each domain: twice as fast.
+    return [partial(cost, W=W.contiguous()) for W in problem.W_train.unbind(1)]
+
+
 def _players(settings: LQRSettings, start: Tensor, num_players: int) -> LinearPlayers:
     """All start at the same controller ``[R, n_u, ...]``, and so does their average."""
     return LinearPlayers(
         start.unsqueeze(1).expand(-1, num_players, -1, -1),
         lambda weights: _optimizer(settings, weights),
         max_gradient_norm=settings.max_gradient_norm,
+        order=settings.order,
     )
 
 

@@ -29,6 +29,8 @@ PIECE = 256  # rows of a table that are evaluated together
 Weights = dict[str, Tensor]
 Outputs = tuple[Tensor, Tensor]
 Acting = Callable[[Tensor], Outputs]  # what is done where observations are seen
+PullBack = Callable[[Tensor, Tensor], list[Tensor]]  # slopes in the outputs -> in the weights
+Layers = list[tuple[np.ndarray, np.ndarray]]  # matrices [R, inputs, units], biases [R, 1, units]
 
 
 class Network(ABC):
@@ -64,6 +66,14 @@ class Network(ABC):
     @abstractmethod
     def __call__(self, weights: Weights, observations: Tensor) -> Outputs:
         """``observations [R, B, ...]`` -> parameters ``[R, B, P]``, values ``[R, B]``."""
+
+    def vjp(self, weights: Weights, observations: Tensor) -> tuple[Outputs, PullBack]:
+        """The outputs, and what takes a loss's slopes in them to those in the weights.
+
+        It is the vector-Jacobian product: slopes of the shapes of parameters and values -> one
+        ``[R, ...]`` for each of the weights, in their order. Nothing else has a gradient.
+        """
+        return vjp(self, weights, observations)
 
     @checked
     def _check(self, players: Annotated[Sequence[Weights], "E"]) -> None:
@@ -138,6 +148,44 @@ class DenseNetwork(Network):
             parameters = torch.cat([parameters, deviation.expand_as(parameters)], -1)
         return parameters, values
 
+    def vjp(self, weights: Weights, observations: Tensor) -> tuple[Outputs, PullBack]:
+        """By hand, in NumPy on the CPU: for small minibatches torch would take twice as long."""
+        if observations.device.type != "cpu":
+            return super().vjp(weights, observations)
+        layers = [self._layers(weights, part) for part in self.layers]
+        seen = [inputs_and_output(own, observations.numpy()) for own in layers]
+        (*_, parameters), (*_, values) = seen
+        deviation = None
+        if self.distribution is Gaussian:
+            deviation = np.exp(weights["log_std"].numpy())
+            parameters = _with_deviation(parameters, deviation)
+
+        def pull_back(of_parameters: Tensor, of_values: Tensor) -> list[Tensor]:
+            of_actor = of_parameters.numpy()[..., : self.num_actions]
+            slopes = (of_actor, of_values.unsqueeze(-1).numpy())
+            found = [
+                slopes_of_layers(own, x, y) for own, x, y in zip(layers, seen, slopes, strict=True)
+            ]
+            named = {
+                f"{layer}.{kind}": slope
+                for part, own in zip(self.layers.values(), found, strict=True)
+                for layer, pair in zip(part, own, strict=True)
+                for kind, slope in zip(("weight", "bias"), pair, strict=True)
+            }
+            if deviation is not None:
+                of_deviation = of_parameters.numpy()[..., self.num_actions :]
+                named["log_std"] = deviation * of_deviation.sum(1)
+            return [torch.from_numpy(named[name]) for name in weights]
+
+        return (torch.from_numpy(parameters), torch.from_numpy(values[..., 0])), pull_back
+
+    def _layers(self, weights: Weights, part: str) -> Layers:
+        """Views of the weights of the ``actor`` or the ``critic``."""
+        return [
+            (weights[f"{name}.weight"].numpy(), weights[f"{name}.bias"].numpy()[:, None])
+            for name in self.layers[part]
+        ]
+
     def frozen(self, players: Sequence[Weights]) -> Acting:
         """The average that acts, as a function of ``observations [R, B, O]``.
 
@@ -146,30 +194,21 @@ class DenseNetwork(Network):
         self._check(players)
         if next(iter(players[0].values())).device.type != "cpu":
             return super().frozen(players)
-        weights = [
-            {name: w.detach().numpy().copy() for name, w in player.items()} for player in players
-        ]
+        players = copied(players)
+        actors, critics = ([self._layers(own, part) for own in players] for part in self.layers)
         deviation = None
         if self.distribution is Gaussian:
-            deviation = np.mean([np.exp(own["log_std"]) for own in weights], 0)[:, None]
+            deviation = np.mean([own["log_std"].exp().numpy() for own in players], 0)
 
-        def outputs(own: dict[str, np.ndarray], part: str, x: np.ndarray) -> np.ndarray:
-            for layer in self.layers[part]:
-                x = x @ own[f"{layer}.weight"] + own[f"{layer}.bias"][:, None]
-                if layer != self.layers[part][-1]:
-                    x = np.tanh(x)
-            return x
+        def outputs(parts: list[Layers], x: np.ndarray) -> np.ndarray:
+            each = [inputs_and_output(own, x)[-1] for own in parts]
+            return np.sum(each, 0) / len(each)
 
         def policy(observations: Tensor) -> Outputs:
             x = observations.numpy()
-            parameters, values = (
-                np.sum([outputs(own, part, x) for own in weights], 0) / len(weights)
-                for part in ("actor", "critic")
-            )
-            values = values[..., 0]
+            parameters, values = outputs(actors, x), outputs(critics, x)[..., 0]
             if deviation is not None:
-                spread = np.broadcast_to(deviation, parameters.shape)
-                parameters = np.concatenate([parameters, spread], -1)
+                parameters = _with_deviation(parameters, deviation)
             return torch.from_numpy(parameters), torch.from_numpy(values)
 
         return policy
@@ -270,6 +309,10 @@ class OnTable:
         logits, values = self.network.after_pooling(weights, pooled)
         return chosen_rows(logits, position), chosen_rows(values, position)
 
+    def vjp(self, weights: Weights, indices: Tensor) -> tuple[Outputs, PullBack]:
+        """As that of a network."""
+        return vjp(self, weights, indices)
+
     def _pooled(self, weights: Weights) -> Tensor:
         """The distinct squares after the first convolution and its pooling, ``[R, squares, 16]``.
 
@@ -312,10 +355,36 @@ def averaged(network: Callable[[Weights, Tensor], Outputs], players: Sequence[We
     return policy
 
 
+def vjp(
+    network: Callable[[Weights, Tensor], Outputs], weights: Weights, observations: Tensor
+) -> tuple[Outputs, PullBack]:
+    """:meth:`Network.vjp` by torch's automatic differentiation."""
+    leaves = {name: w.detach().requires_grad_() for name, w in weights.items()}
+    with torch.enable_grad():
+        outputs = network(leaves, observations)
+
+    def pull_back(of_parameters: Tensor, of_values: Tensor) -> list[Tensor]:
+        slopes = (of_parameters, of_values)
+        return list(torch.autograd.grad(outputs, list(leaves.values()), slopes))
+
+    return (outputs[0].detach(), outputs[1].detach()), pull_back
+
+
 @checked
 def copied(players: Sequence[Weights]) -> list[Weights]:
     """The players as they are now, without gradients; training changes weights in place."""
     return [{name: w.detach().clone() for name, w in player.items()} for player in players]
+
+
+def in_one_row(weights: Weights) -> tuple[Tensor, Weights]:
+    """A copy with all weights of a run in one row ``[R, P]``, and its parts by name.
+
+    They share their memory, so an optimiser has one tensor to move instead of many.
+    """
+    row = torch.cat([w.flatten(1) for w in weights.values()], 1)
+    parts = row.split([w[0].numel() for w in weights.values()], 1)
+    named = zip(weights.items(), parts, strict=True)
+    return row, {name: part.unflatten(1, w.shape[1:]) for (name, w), part in named}
 
 
 def dense(weights: Weights, name: str, x: Tensor) -> Tensor:
@@ -337,6 +406,39 @@ class Tanh(torch.autograd.Function):
     def backward(ctx: Any, gradient: Tensor) -> Tensor:
         (y,) = ctx.saved_tensors
         return torch.ops.aten.tanh_backward(gradient, y)  # gradient (1 - y^2), in one pass
+
+
+def inputs_and_output(layers: Layers, x: np.ndarray) -> list[np.ndarray]:
+    """What goes into each of the layers, with tanh between them, and what comes out at the end."""
+    values = [x]
+    for number, (matrix, bias) in enumerate(layers):
+        y = values[-1] @ matrix
+        y += bias
+        values.append(y if number == len(layers) - 1 else np.tanh(y, out=y))
+    return values
+
+
+def slopes_of_layers(layers: Layers, values: list[np.ndarray], slope: np.ndarray) -> Layers:
+    """From a loss's slope ``[R, B, units]`` in the output to those in matrices and biases.
+
+    ``values`` are those of :func:`inputs_and_output`. Back through a layer y = tanh(x) W + b::
+
+        dL/dW = tanh(x)' dL/dy,    dL/db = 1' dL/dy,    dL/dx = (dL/dy W') (1 - tanh(x)^2)
+    """
+    ones = np.ones((1, 1, slope.shape[1]), slope.dtype)
+    found: Layers = []
+    for number in reversed(range(len(layers))):
+        x = values[number]
+        found.append((x.swapaxes(1, 2) @ slope, (ones @ slope)[:, 0]))  # a product: a fast sum
+        if number > 0:
+            slope = slope @ layers[number][0].swapaxes(1, 2)
+            slope *= 1 - x * x
+    return found[::-1]
+
+
+def _with_deviation(means: np.ndarray, deviation: np.ndarray) -> np.ndarray:
+    """Parameters of a Gaussian from means ``[R, B, A]`` and deviations ``[R, A]``."""
+    return np.concatenate([means, np.broadcast_to(deviation[:, None], means.shape)], -1)
 
 
 def _orthogonal(shape: tuple[int, int], generator: np.random.Generator) -> np.ndarray:

@@ -28,11 +28,11 @@ from ipo.checks import (
     one_of,
 )
 from ipo.distributions import Distribution, Generators
-from ipo.game import domains_of_players, play_round
-from ipo.networks import Network, OnTable, Weights, chosen_rows
+from ipo.game import Move, moves, play_round
+from ipo.networks import Network, OnTable, Weights, chosen_rows, in_one_row
 from ipo.rollouts import Collector, Device, Environments, Rollout, TimeOuts
 
-METHODS = ("ppo", "ipo", "ensemble")
+METHODS = ("ppo", "ipo", "ensemble", "in_turn")
 NORMALIZATIONS = ("none", "minibatch", "rollout")
 
 # (domains, how many copies of each, a generator for each run) -> environments
@@ -45,7 +45,8 @@ class PPOSettings:
     """How a policy is trained. Sizes and rates are those of the paper's coloured keys (Table 6).
 
     Attributes:
-        method: ``ppo``, ``ipo`` or ``ensemble``.
+        method: ``ppo``, ``ipo`` or ``ensemble``; or ``in_turn``, one network for all domains like
+            PPO's, trained on one domain at a time like IPO's.
         learning_rate: of Adam; the paper has 1e-3 for PPO and 5e-4 for IPO.
         adam_epsilon: keeps Adam's denominator from 0.
         num_updates: rounds, in each of which every player collects and learns once.
@@ -93,13 +94,13 @@ class PPOSettings:
     time_outs: TimeOuts = "bootstrap"
     skip_last_frames: bool = False
 
-    def domains_of_players(self, num_domains: int) -> list[list[int]]:
-        """The domains that each player owns; ``ppo`` is what the game calls ``pooled``."""
-        return domains_of_players("pooled" if self.method == "ppo" else self.method, num_domains)
+    def moves(self, num_domains: int) -> list[Move]:
+        """Of a round; ``ppo`` is what the game calls ``pooled``."""
+        return moves("pooled" if self.method == "ppo" else self.method, num_domains)
 
-    def copies_of_players(self, num_domains: int) -> list[list[int]]:
-        """How many copies each player has of each domain that it owns."""
-        owned = self.domains_of_players(num_domains)
+    def copies(self, num_domains: int) -> list[list[int]]:
+        """How many copies each move has of each of its domains."""
+        owned = [move.domains for move in self.moves(num_domains)]
         num_owners = len(owned) if len(owned[0]) > 1 else 1
         if not isinstance(self.num_envs, tuple):
             if self.num_envs % (num_domains * num_owners):
@@ -152,7 +153,9 @@ class Training:
 
     Attributes:
         players: weights of every player; they change in place.
-        collectors: every player's environments.
+        rows: the same memory as one ``[R, P]`` for each player, which the optimisers move.
+        moves: of a round: who moves, on which domains.
+        collectors: the environments of every move.
         num_frames: seen so far, in each run.
 
     Raises:
@@ -171,8 +174,8 @@ class Training:
         seeds: Seeds,
         device: Device = "cpu",
     ) -> None:
-        owned = settings.domains_of_players(num_domains)
-        copies = settings.copies_of_players(num_domains)
+        self.moves = settings.moves(num_domains)
+        copies = settings.copies(num_domains)
         for own in copies:
             settings.size_of_minibatches(settings.num_steps * sum(own))
         streams = [np.random.SeedSequence(seed).spawn(3) for seed in seeds]
@@ -180,16 +183,17 @@ class Training:
             [np.random.default_rng(stream[i]) for stream in streams] for i in range(3)
         )
         self.network, self.settings, self.num_frames = network, settings, 0
-        starts = [network.start(self.draws) for _ in owned]
-        self.players = [{name: w.to(device) for name, w in own.items()} for own in starts]
-        leaves = [[w.requires_grad_() for w in player.values()] for player in self.players]
+        num_players = 1 + max(move.player for move in self.moves)
+        drawn = [network.start(self.draws) for _ in range(num_players)]
+        starts = [in_one_row({name: w.to(device) for name, w in own.items()}) for own in drawn]
+        self.rows, self.players = map(list, zip(*starts, strict=True))
         self.optimizers = [
-            torch.optim.Adam(own, settings.learning_rate, eps=settings.adam_epsilon, fused=True)
-            for own in leaves
+            torch.optim.Adam([own], settings.learning_rate, eps=settings.adam_epsilon, fused=True)
+            for own in self.rows
         ]
         environments = [
-            make_environments(domains, own, self.resets)
-            for domains, own in zip(owned, copies, strict=True)
+            make_environments(move.domains, own, self.resets)
+            for move, own in zip(self.moves, copies, strict=True)
         ]
         self.collectors = [settings.collector(own, device) for own in environments]
 
@@ -204,19 +208,19 @@ class Training:
             yield self.num_frames, self.players
 
     def update(self, only: int | None = None) -> None:
-        """One round of Algorithm 1; or the move of one player, while all else stands still."""
+        """One round of Algorithm 1; or one of its moves, while all else stands still."""
         if only is None:
-            play_round(len(self.players), self.respond, num_inner_rounds=1, move_phi=None)
+            play_round(len(self.moves), self.respond, num_inner_rounds=1, move_phi=None)
         else:
-            check_count("only", only, 0, len(self.players) - 1)
+            check_count("only", only, 0, len(self.moves) - 1)
             self.respond(only)
 
     def respond(self, d: int) -> None:
-        """Player d's move: it collects with the average of all players, and learns."""
+        """Move d: its player collects with the average of all players, and learns."""
         average = self.network.frozen(self.players)
         rollout = self.collectors[d].collect(average, self.network.distribution, self.draws)
         self.num_frames += rollout.values[0].numel()
-        self.improve(d, rollout.frames())
+        self.improve(self.moves[d].player, rollout.frames())
 
     def improve(self, d: int, frames: Rollout) -> None:
         """Some epochs of PPO for player d on frames ``[R, F]``, while the others stand still.
@@ -224,20 +228,19 @@ class Training:
         The player sees its own outputs only through the average, so they carry the factor 1 / E.
         """
         settings, player = self.settings, self.players[d]
-        share = 1 / len(self.players)
+        distribution, share = self.network.distribution, 1 / len(self.players)
         others = self._others(d, frames.observations)
         if settings.normalize_advantages == "rollout":
             frames = frames._replace(advantages=standardize(frames.advantages))
         for epoch in range(settings.num_epochs):
             skip = settings.skip_last_frames and epoch % 2 == 1
-            for chosen in minibatches(frames, settings, self.orders, skip):
-                batch = Rollout(*(chosen_rows(x, chosen) for x in frames))
-                parameters, values = self.network(player, batch.observations)
+            for batch, theirs in minibatches(frames, others, settings, self.orders, skip):
+                (parameters, values), pull_back = self.network.vjp(player, batch.observations)
                 if others:
-                    parameters = chosen_rows(others[0], chosen) + share * parameters
-                    values = chosen_rows(others[1], chosen) + share * values
-                loss = clipped_loss(self.network.distribution, parameters, values, batch, settings)
-                self._descend(d, loss)
+                    parameters = theirs[0] + share * parameters
+                    values = theirs[1] + share * values
+                slopes = loss_gradient(distribution, parameters, values, batch, settings)
+                self._descend(d, pull_back(*(share * slope for slope in slopes)))
 
     def _others(self, d: int, observations: Tensor) -> list[Tensor]:
         """What the others contribute to the average; nothing where there are none."""
@@ -247,13 +250,9 @@ class Training:
         share = 1 / len(self.players)
         return [(1 - share) * part for part in self.network.frozen(others)(observations)]
 
-    def _descend(self, d: int, loss: Tensor) -> None:
-        leaves = list(self.players[d].values())
-        gradients = torch.autograd.grad(loss.sum(), leaves)
-        clipped = clip_gradients(gradients, self.settings.max_gradient_norm)
-        for leaf, gradient in zip(leaves, clipped, strict=True):
-            # The fused Adam pairs weights and gradients by their place in memory.
-            leaf.grad = gradient.contiguous()
+    def _descend(self, d: int, gradients: list[Tensor]) -> None:
+        in_rows = torch.cat([gradient.flatten(1) for gradient in gradients], 1)
+        self.rows[d].grad = clip_gradient(in_rows, self.settings.max_gradient_norm)
         self.optimizers[d].step()
 
     @torch.no_grad()
@@ -283,6 +282,15 @@ class Training:
         }
 
     def restore(self, state: dict[str, Any]) -> None:
+        """Go on from ``state()``.
+
+        Raises:
+            ValueError: a state of other weights, or of a version that kept moments for each weight.
+        """
+        for row, moments in zip(self.rows, state["optimizers"], strict=True):
+            shapes = [tuple(own["exp_avg"].shape) for own in moments]
+            if shapes not in ([], [row.shape]):  # the fused Adam would read beyond their ends
+                raise ValueError(f"state: has moments of shapes {shapes}, must be {[row.shape]}")
         self.num_frames = state["num_frames"]
         self.set_players(state["players"])
         for optimizer, moments in zip(self.optimizers, state["optimizers"], strict=True):
@@ -298,15 +306,24 @@ class Training:
 
 
 def minibatches(
-    frames: Rollout, settings: PPOSettings, generators: Generators, skip_last_frames: bool
-) -> Iterator[Tensor]:
-    """Indices ``[R, B]`` of frames in an order of each run's own."""
-    numbers = np.arange(frames.actions.shape[1])
+    frames: Rollout,
+    others: Sequence[Tensor],
+    settings: PPOSettings,
+    generators: Generators,
+    skip_last_frames: bool,
+) -> Iterator[tuple[Rollout, list[Tensor]]]:
+    """``[R, B]`` of the frames and of ``others``, in an order of each run's own."""
+    num_frames = frames.actions.shape[1]
+    numbers = np.arange(num_frames)
     if skip_last_frames:
         numbers = numbers[(numbers + 1) % settings.num_steps != 0]
     order = torch.tensor(np.stack([generator.permutation(numbers) for generator in generators]))
     order = order.to(frames.actions.device)
-    yield from order.split(settings.size_of_minibatches(frames.actions.shape[1]), dim=1)
+    size = settings.size_of_minibatches(num_frames)
+    # All in order at once, then in slices: cheaper than to choose for each minibatch.
+    columns = [chosen_rows(x, order).split(size, dim=1) for x in (*frames, *others)]
+    for batch in zip(*columns, strict=True):
+        yield Rollout(*batch[: len(frames)]), list(batch[len(frames) :])
 
 
 def clipped_loss(
@@ -319,27 +336,59 @@ def clipped_loss(
     """PPO's loss ``[R]``, to be minimised, on a minibatch ``[R, B]``::
 
         - mean min(rho A, clip(rho, 1 - c, 1 + c) A) - w_e mean H(pi)
-        + w_v mean max((V - G)^2, (V_old + clip(V - V_old, -c, c) - G)^2),
+        + w_v mean max((V - G)^2, (clip(V, V_old - c, V_old + c) - G)^2),
         rho = pi(a | o) / pi_old(a | o)
 
     G are the returns of the rollout.
     """
+    gain, near_gain, error, near_error = _terms(distribution, parameters, values, batch, settings)
+    return (
+        -torch.minimum(gain, near_gain).mean(1)
+        - settings.entropy_weight * distribution.entropy(parameters).mean(1)
+        + settings.value_weight * torch.maximum(error**2, near_error**2).mean(1)
+    )
+
+
+def loss_gradient(
+    distribution: type[Distribution],
+    parameters: Tensor,
+    values: Tensor,
+    batch: Rollout,
+    settings: PPOSettings,
+) -> tuple[Tensor, Tensor]:
+    """Of :func:`clipped_loss` in each frame's parameters ``[R, B, P]`` and value ``[R, B]``::
+
+        - (1/B) [rho A grad log pi(a | o) + w_e grad H(pi)],        (2 w_v / B) (V - G)
+
+    without rho A and V - G where the minimum and the maximum are those of the clipped numbers,
+    which are constant. By hand, for torch would take four times as long.
+    """
+    gain, near_gain, error, near_error = _terms(distribution, parameters, values, batch, settings)
+    share = 1 / values.shape[1]
+    weights = -share * gain.masked_fill(near_gain < gain, 0.0)
+    entropy_weight = -share * settings.entropy_weight
+    of_parameters = distribution.gradient(parameters, batch.actions, weights, entropy_weight)
+    of_values = error.masked_fill(near_error**2 > error**2, 0.0)
+    return of_parameters, 2 * share * settings.value_weight * of_values
+
+
+def _terms(
+    distribution: type[Distribution],
+    parameters: Tensor,
+    values: Tensor,
+    batch: Rollout,
+    settings: PPOSettings,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """rho A, clip(rho) A, V - G and clip(V) - G, ``[R, B]`` each."""
     gains = batch.advantages
     if settings.normalize_advantages == "minibatch":
         gains = standardize(gains)
     ratio = distribution.log_probability(parameters, batch.actions) - batch.log_probabilities
     ratio = ratio.exp()
     near = ratio.clamp(1 - settings.clip, 1 + settings.clip)
-    policy_loss = -torch.minimum(ratio * gains, near * gains).mean(1)
-    change = (values - batch.values).clamp(-settings.clip, settings.clip)
-    errors = torch.maximum(
-        (values - batch.returns) ** 2, (batch.values + change - batch.returns) ** 2
-    )
-    return (
-        policy_loss
-        - settings.entropy_weight * distribution.entropy(parameters).mean(1)
-        + settings.value_weight * errors.mean(1)
-    )
+    lowest, highest = batch.values - settings.clip, batch.values + settings.clip
+    near_values = values.clamp(lowest, highest)
+    return ratio * gains, near * gains, values - batch.returns, near_values - batch.returns
 
 
 def standardize(gains: Tensor) -> Tensor:
@@ -347,8 +396,7 @@ def standardize(gains: Tensor) -> Tensor:
     return (gains - gains.mean(1, True)) / (gains.std(1, keepdim=True) + 1e-8)
 
 
-def clip_gradients(gradients: Sequence[Tensor], max_norm: float) -> list[Tensor]:
-    """Gradients ``[R, ...]`` of a player, scaled so that their joint norm is at most max_norm."""
-    squares = torch.stack([gradient.flatten(1).square().sum(1) for gradient in gradients])
-    scale = (max_norm / squares.sum(0).sqrt()).clamp(max=1.0)
-    return [g * scale.reshape(-1, *[1] * (g.dim() - 1)) for g in gradients]
+def clip_gradient(gradient: Tensor, max_norm: float) -> Tensor:
+    """A player's gradient ``[R, P]``, scaled so that its norm is at most max_norm in each run."""
+    norm = torch.linalg.vector_norm(gradient, dim=1, keepdim=True)
+    return gradient * (max_norm / norm).clamp(max=1.0)

@@ -73,16 +73,13 @@ class FromGymnasium:
     def step(self, actions: Tensor) -> Step:
         answer = self.envs.step(actions.flatten(0, 1).numpy())
         observation, reward, terminated, truncated, info = answer
-        last = observation.copy()
-        for copy in np.flatnonzero(terminated | truncated):
-            last[copy] = info["final_obs"][copy]
-        return Step(
-            self._by_run(observation),
-            self._by_run(reward),
-            self._by_run(terminated).bool(),
-            self._by_run(truncated).bool(),
-            self._by_run(last),
-        )
+        last = observation
+        over = np.flatnonzero(terminated | truncated)
+        if len(over):
+            last = observation.copy()
+            for copy in over:
+                last[copy] = info["final_obs"][copy]
+        return Step(*map(self._by_run, (observation, reward, terminated, truncated, last)))
 
     def state(self) -> dict[str, Any]:
         """Of environments that have one."""
@@ -92,7 +89,9 @@ class FromGymnasium:
         self.envs.restore(state)  # type: ignore[attr-defined]
 
     def _by_run(self, values: np.ndarray) -> Tensor:
-        return torch.tensor(values, dtype=torch.float32).unflatten(0, (self.num_runs, -1))
+        """A copy ``[R, N, ...]``, in single precision where they are numbers."""
+        copy = values.astype(bool if values.dtype == bool else np.float32)
+        return torch.from_numpy(copy.reshape(self.num_runs, -1, *values.shape[1:]))
 
 
 class RewardNormalizer:

@@ -1,20 +1,19 @@
-"""Statistics over runs: intervals, paired differences, probability of improvement.
+"""Statistics over runs: intervals, paired differences, power, probability of improvement.
 
-All methods see the same seeds, so comparisons are paired. Intervals are bootstrap intervals
-over runs; with few runs they are a little too narrow.
+All methods see the same seeds, so comparisons are paired. There is one procedure for all: Student's
+t. With ten runs a percentile bootstrap of the mean, which was used here once, is too narrow: it
+covers the truth in 89 to 91 % of the cases instead of 95.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import scipy.stats
 
-from ipo.checks import checked
-
-NUM_RESAMPLES = 10_000
+from ipo.checks import Count, Finite, Positive, checked
 
 
 def _check_runs(name: str, values: object) -> None:
@@ -31,38 +30,60 @@ Runs = Annotated[Sequence[float], _check_runs]  # [num_runs]
 
 
 @checked
-def bootstrap_interval(values: Runs, rng: np.random.Generator) -> tuple[float, float]:
-    """95 % percentile bootstrap interval of the mean of runs ``[num_runs]``.
+def mean_interval(values: Runs) -> tuple[float, float]:
+    """95 % interval of the mean of runs ``[num_runs]``, by Student's t.
+
+        mean +- t s / sqrt(n),      t the 97.5 % quantile with n - 1 degrees of freedom
 
     Raises:
         ValueError: fewer than two runs, values that are not finite.
     """
     runs = np.asarray(values, dtype=float)
-    if np.ptp(runs) == 0:  # every resample is the same; scipy would warn and return NaN
-        return float(runs[0]), float(runs[0])
-    interval = scipy.stats.bootstrap(
-        (runs,),
-        np.mean,
-        confidence_level=0.95,
-        n_resamples=NUM_RESAMPLES,
-        axis=-1,
-        method="percentile",
-        rng=rng,
-    ).confidence_interval
-    return float(interval.low), float(interval.high)
+    half = scipy.stats.t.ppf(0.975, len(runs) - 1) * scipy.stats.sem(runs)
+    return float(runs.mean() - half), float(runs.mean() + half)
+
+
+class Difference(NamedTuple):
+    """Mean of a difference over runs, its 95 % interval, and p of the t-test against zero."""
+
+    mean: float
+    low: float
+    high: float
+    p: float
 
 
 @checked
-def paired_difference(
-    values: Runs, baseline: Runs, rng: np.random.Generator
-) -> tuple[float, float, float]:
-    """Mean of ``values - baseline`` run by run, with its 95 % bootstrap interval."""
+def paired_difference(values: Runs, baseline: Runs) -> Difference:
+    """``values - baseline`` run by run: its mean, with :func:`mean_interval`, and p.
+
+    Raises:
+        ValueError: as there, and another number of runs.
+    """
     if len(values) != len(baseline):
         raise ValueError(
             f"baseline: has {len(baseline)} runs, must have {len(values)}, one for each value"
         )
-    difference = np.subtract(values, baseline, dtype=float).tolist()
-    return float(np.mean(difference)), *bootstrap_interval(difference, rng)
+    difference = np.subtract(values, baseline, dtype=float)
+    mean, error = difference.mean(), scipy.stats.sem(difference)
+    # Where no run differs from the others, t is 0 / 0 or infinite.
+    p = 2 * scipy.stats.t.sf(abs(mean) / error, len(difference) - 1) if error else float(mean == 0)
+    return Difference(float(mean), *mean_interval(difference.tolist()), float(p))
+
+
+@checked
+def power(effect: Finite, spread: Positive, num_runs: Count) -> float:
+    """Probability that the interval of a true effect does not contain zero.
+
+    Of the two-sided paired t-test at 5 %, by the noncentral t distribution. ``spread`` is the
+    standard deviation of the differences over runs.
+    """
+    degrees = num_runs - 1
+    if degrees < 1:
+        raise ValueError(f"num_runs = {num_runs}: must be at least 2")
+    critical = scipy.stats.t.ppf(0.975, degrees)
+    shift = effect / spread * np.sqrt(num_runs)
+    found = scipy.stats.nct(degrees, shift)
+    return float(found.sf(critical) + found.cdf(-critical))
 
 
 @checked

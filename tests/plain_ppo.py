@@ -39,12 +39,12 @@ def averaged(players, images):
     return sum(logits) / len(players), sum(values) / len(players)
 
 
-def train(players, envs, s, draws, orders, seeds, at_once=True):
-    """Yields the players after every update; ``envs[d]`` is the list that player d acts in.
+def train(players, envs, s, draws, orders, seeds, at_once=True, movers=None):
+    """Yields the players after every update; ``envs[m]`` is the list that move m acts in.
 
-    ``seeds[d]`` are those of the first resets; ``draws`` and ``orders`` are the generators of
-    actions and of the minibatches. The network is called for what all environments show
-    ``at_once``, or for each of them alone.
+    Move m is that of player ``movers[m]``, or of player m. ``seeds[m]`` are those of the first
+    resets; ``draws`` and ``orders`` are the generators of actions and of the minibatches. The
+    network is called for what all environments show ``at_once``, or for each of them alone.
     """
     like = next(players[0].parameters())
     optimizers = [torch.optim.Adam(player.parameters(), s.learning_rate) for player in players]
@@ -53,8 +53,8 @@ def train(players, envs, s, draws, orders, seeds, at_once=True):
         for own in zip(envs, seeds, strict=True)
     ]
     for _ in range(s.num_updates):
-        for d in range(len(players)):
-            rollout = collect(players, envs[d], seen[d], s, draws, like, at_once)
+        for m, d in enumerate(movers or range(len(players))):
+            rollout = collect(players, envs[m], seen[m], s, draws, like, at_once)
             improve(players, d, optimizers[d], rollout, s, orders)
         yield players
 

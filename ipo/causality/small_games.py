@@ -21,10 +21,10 @@ from torch import Tensor
 
 from ipo.causality.predictors import Regression
 from ipo.checks import Natural, Positive, check_checkpoints, checked, one_of
-from ipo.game import OWNERSHIPS, Cost, LinearPlayers, Order, average, domains_of_players, nash_gap
+from ipo.game import Cost, LinearPlayers, Order, average, moves, nash_gap
 from ipo.optimizers import make_optimizer
 
-GAME_METHODS = (*OWNERSHIPS, "separate")
+GAME_METHODS = ("pooled", "ipo", "ensemble", "separate")
 
 Costs = Annotated[Sequence[Cost], "E"]  # of the domains
 Players = Annotated[Tensor, "R E P"]
@@ -85,7 +85,7 @@ def play(
     if settings.method == "separate":
         yield from _play_separately(costs, start, settings, checkpoints)
         return
-    owned = domains_of_players(settings.method, len(costs))
+    owned = [move.domains for move in moves(settings.method, len(costs))]
     starts = start if start.dim() == 3 else start.unsqueeze(1).expand(-1, len(owned), -1)
     players = LinearPlayers(
         starts,

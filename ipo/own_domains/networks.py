@@ -85,4 +85,4 @@ class ImageNetwork(VectorNetwork):
         kernels = ((own, w.T.unflatten(1, (-1, 3, 3)), b) for own, w, b in runs)
         return torch.stack([conv2d(own, k, b, stride=2, padding=1) for own, k, b in kernels]).relu()
 
-    frozen = Network.frozen  # in torch: here convolutions take the time
+    frozen, vjp = Network.frozen, Network.vjp  # in torch: here convolutions take the time

@@ -9,9 +9,9 @@ For each cell the first recorded batch is computed again and held beside the shi
 - ``alike``: for networks, whose training is chaotic, runs that could be others of the same cell;
 - ``differs`` otherwise, and the command fails in the end.
 
-The outcome stands in ``data/confirmed.json`` with the commit of the code. What has been
-confirmed at the present commit of the code, or since COMMIT, is not computed again, so that an
-interrupted run goes on.
+The outcome stands in ``data/confirmed.json`` with the commit of the code, machine and packages.
+What has been confirmed at the present commit of the code, or since COMMIT, is not computed again,
+so that an interrupted run goes on.
 """
 
 from __future__ import annotations
@@ -138,6 +138,7 @@ def _outcome(part: Slice, scratch: Path) -> tuple[str, dict[str, Any]]:
         "commit": origin.commit(),
         "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
         "machine": origin.machine(),
+        "packages": ", ".join(f"{name} {number}" for name, number in origin.versions().items()),
     }
 
 

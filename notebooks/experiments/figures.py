@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from ipo.causality.scm import SCM
 from ipo.networks import Network
-from ipo.stats import bootstrap_interval
+from ipo.stats import mean_interval
 
 # Colours of Okabe and Ito, which colour-blind readers can tell apart; markers for print.
 STYLES = {
@@ -66,7 +66,7 @@ def metric_by(rows: pd.DataFrame, metric: str, x: str) -> pd.DataFrame:
     """One row per method and ``x`` with ``mean, low, high``: a 95 % interval over runs."""
 
     def summary(values: pd.Series) -> pd.Series:
-        low, high = bootstrap_interval(values.to_numpy(), np.random.default_rng(0))
+        low, high = mean_interval(values.to_numpy())
         return pd.Series({"mean": values.mean(), "low": low, "high": high})
 
     chosen = rows[rows["metric"] == metric]
@@ -107,7 +107,7 @@ def draw_runs(ax: Axes, values: dict[str, np.ndarray], names: dict[str, str]) ->
         color = STYLES[arm.split("_")[0]][1]
         place = column + rng.uniform(-0.2, 0.2, len(runs))
         ax.scatter(place, runs, s=12, alpha=0.5, lw=0, color=color)
-        low, high = bootstrap_interval(runs, rng)
+        low, high = mean_interval(runs)
         ax.plot([column + 0.3] * 2, [low, high], color="black", lw=2)
         ax.plot(column + 0.3, runs.mean(), color="black", marker="o", ms=5)
     ax.set_xticks(range(len(values)), [names[arm].replace(", ", ",\n") for arm in values])

@@ -340,7 +340,15 @@ def short_if_small(cell: Cell) -> Cell | None:
 
 EXPERIMENTS = {
     name: Experiment(run_cell, Cell, short_if_small)
-    for name in ("tables", "starts", "more_domains", "closed_form", "optimizers", "controls")
+    for name in (
+        "tables",
+        "starts",
+        "more_domains",
+        "closed_form",
+        "optimizers",
+        "controls",
+        "turns",
+    )
 } | {
     "curves": Experiment(run_curve, Cell, short),
     "closed_loops": Experiment(run_closed_loops, Cell, short),
@@ -517,13 +525,12 @@ def control_table(rows: pd.DataFrame) -> pd.DataFrame:
 
 def control_differences(rows: pd.DataFrame) -> pd.DataFrame:
     """Paired differences of cost in a new domain, run by run."""
-    rng = np.random.default_rng(0)
     by_run = rows[rows["metric"] == "test_cost"].pivot_table(
         index=["num_domains", "run"], columns="method", values="value"
     )
 
     def row(n: int, block: pd.DataFrame, method: str, baseline: str) -> dict[str, Any]:
-        mean, low, high = paired_difference(block[method], block[baseline], rng)
+        mean, low, high, _ = paired_difference(block[method], block[baseline])
         better = probability_of_improvement(block[method], block[baseline])
         return {
             "difference": PAIRS[method, baseline],

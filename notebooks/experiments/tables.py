@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import numpy as np
 import pandas as pd
 from pandas.io.formats.style import Styler
 
 from experiments.store import Store
-from ipo.stats import bootstrap_interval
+from ipo.stats import mean_interval
 
 
 def show(frame: pd.DataFrame, formats: dict[str, str] | str | None = None) -> Styler:
@@ -72,7 +71,7 @@ def largest_differences(
 
 def mean_and_interval(values: pd.Series, digits: int = 2) -> str:
     """Of runs, with the 95 % interval of the mean."""
-    low, high = bootstrap_interval(values.to_numpy(), np.random.default_rng(0))
+    low, high = mean_interval(values.to_numpy())
     return f"{values.mean():.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
 
 

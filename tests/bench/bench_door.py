@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
 from experiments.doors.training import NETWORK, new_training, published_door
@@ -115,6 +116,7 @@ def main() -> None:
         parser.error("must be: --blocks >= 1, --steps >= 4")
 
     torch.set_num_threads(1)
+    threadpool_limits(1)  # NumPy's, with which networks act and learn
     speeds = {
         name: statistics.median(values)
         for name, values in simulation(options.steps, options.blocks).items()

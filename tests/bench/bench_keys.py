@@ -59,8 +59,8 @@ def stacked(task: Keys, method: str, num_runs: int) -> Iterator:
 def plain(method: str, at_once: bool) -> Iterator:
     """Training of one run in MiniGrid; every ``next`` is an update."""
     settings = published(method)
-    owned = settings.domains_of_players(len(COLORS))
-    copies = settings.copies_of_players(len(COLORS))
+    owned = [move.domains for move in settings.moves(len(COLORS))]
+    copies = settings.copies(len(COLORS))
     envs = [
         [ImgObsWrapper(ColoredKeysEnv(color=COLORS[d])) for d in domains for _ in range(own[0])]
         for domains, own in zip(owned, copies, strict=True)

@@ -13,7 +13,7 @@ from ipo import game, lqr_learners, ppo
 @pytest.mark.parametrize(
     "function",
     [
-        game.domains_of_players,
+        game.moves,
         game.play_round,
         game.average,
         game.LinearPlayers._move_in_turn,

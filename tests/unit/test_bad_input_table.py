@@ -199,10 +199,13 @@ def rows_of_lqr() -> Iterator[Row]:
     yield row(lqr_learners.train, training, **refused, checkpoints=late)
     values = bad("sample size", [], [1.0]) + bad("not finite", [1.0, NAN], [1.0, INF])
     values += bad("shape", [[1.0, 2.0]], [[1.0], [2.0]]) + bad("kind of object", "ab", ["a", "b"])
-    two = {"values": [1.0, 2.0], "baseline": [2.0, 3.0], "rng": np.random.default_rng(0)}
-    yield row(stats.bootstrap_interval, two, values=values)
+    two = {"values": [1.0, 2.0], "baseline": [2.0, 3.0]}
+    yield row(stats.mean_interval, two, values=values)
     unpaired = values + bad("shape", [1.0, 2.0, 3.0])
     yield row(stats.paired_difference, two, values=values, baseline=unpaired)
+    yield row(
+        stats.power, {"effect": 1.0, "spread": 2.0, "num_runs": 10}, effect=NUMBER, spread=POSITIVE
+    )
     improvement = {"costs": [1.0, 2.0], "baseline": [1.0, 2.0]}
     yield row(stats.probability_of_improvement, improvement, costs=values, baseline=values)
 
@@ -216,10 +219,10 @@ def rows_of_learning() -> Iterator[Row]:
         weights=LIST,
     )
     ownership = {"method": "ipo", "num_domains": 2}
-    yield row(game.domains_of_players, ownership)
+    yield row(game.moves, ownership)
     yield row(
         game.play_round,
-        {"num_players": 2, "respond": never},
+        {"num_moves": 2, "respond": never},
         respond="called at once",
         move_phi="called at once",
     )
@@ -281,7 +284,7 @@ def rows_of_learning() -> Iterator[Row]:
     copies = COUNT + bad("range", (), (0, 4), (4, 2.0))
     yield row(ppo.PPOSettings, {"method": "ipo"}, num_envs=copies)
     settings = ppo.PPOSettings("ipo", num_envs=4, minibatch_size=2, num_steps=4)
-    for function in (settings.domains_of_players, settings.copies_of_players):
+    for function in (settings.moves, settings.copies):
         yield row(function, {"num_domains": 2})
     yield row(settings.size_of_minibatches, {"num_frames": 8})
     yield row(settings.collector, {"environments": environments})
@@ -663,19 +666,22 @@ TRUSTING = {
     r"ipo\.lqr\.feedback_costs": LOOP,
     r"ipo\.lqr\.(LQR\.to|split_domains)": "torch's own conversion and view, by a new name",
     r"ipo\.lqr_learners\.Learner": RECORD,
-    r"ipo\.networks\.(\w+\.(__call__|after_pooling)|averaged|chosen_rows|dense|Tanh.*)": LOOP,
+    r"ipo\.networks\.\w+\.(__call__|after_pooling|vjp)": LOOP,
+    r"ipo\.networks\.(averaged|chosen_rows|dense|in_one_row|vjp|Tanh.*)": LOOP,
+    r"ipo\.networks\.(inputs_and_output|slopes_of_layers)": LOOP,
     r"ipo\.own_domains\.copies\.check_domains": "is a check itself; train_policy shows it",
     r"ipo\.own_domains\.copies\.(Copies.*|is_\w+|dtype_of|clipped)": "of checked domains",
     r"ipo\.own_domains\.policy\.(Policy|Policy\.save|network_for)": "of checked spaces",
     r"ipo\.own_domains\.policy\.Policy\.load": "every flip of a bit is, in test_own_domains.py",
     r"ipo\.own_domains\.policy\.check_network": "is a check itself; train_policy shows it",
-    r"ipo\.own_domains\.networks\.(\w+\.(__call__|frozen)|VectorNetwork)": "as in ipo.networks",
+    r"ipo\.own_domains\.networks\.(\w+\.(__call__|frozen|vjp)|VectorNetwork)": "as in ipo.networks",
     r"ipo\.rollouts\.check_device": "is a check itself; Training shows it",
     r"ipo\.own_domains\.default_settings": "PPOSettings checks",
     r"ipo\.ppo\.Training\.(respond|improve)": LOOP,
-    r"ipo\.ppo\.(minibatches|clipped_loss|standardize|clip_gradients)": LOOP,
+    r"ipo\.ppo\.(minibatches|clipped_loss|loss_gradient|standardize|clip_gradient)": LOOP,
     r"ipo\.(ppo|rollouts)\.\w+\.restore": STATE,
     r"ipo\.rollouts\.(Step|Rollout)": RECORD,
+    r"ipo\.(stats\.Difference|game\.Move)": RECORD,
     r"ipo\.rollouts\.(\w+\.step|\w+\.__call__|Collector\.collect)": LOOP,
     r"ipo\.rollouts\.(value_errors|advantages)": LOOP,
     r"ipo\.causality\.icp\.ICPResult": RECORD,

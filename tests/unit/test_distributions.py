@@ -8,11 +8,12 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import norm
+from small import assert_close
 from torch import Tensor
 
 from experiments.policies import load_policy, save_policy
 from ipo.distributions import Categorical, Gaussian
-from ipo.networks import DenseNetwork
+from ipo.networks import DenseNetwork, vjp
 
 
 def generators(*seeds: int) -> list[np.random.Generator]:
@@ -114,6 +115,25 @@ def test_the_networks_gradient_is_right(distribution):
 
     leaves = tuple(w.requires_grad_() for w in weights.values())
     assert torch.autograd.gradcheck(outputs, leaves)
+
+
+@pytest.mark.parametrize("distribution", [Gaussian, Categorical])
+@pytest.mark.parametrize("hidden", [(), (4,), (4, 3)])
+@pytest.mark.parametrize("dtype, rtol", [(torch.float64, 1e-12), (torch.float32, 1e-5)])
+def test_the_gradient_by_hand_is_that_of_torch(distribution, hidden, dtype, rtol):
+    network = DenseNetwork(3, 2, distribution, hidden)
+    weights = {name: w.to(dtype) for name, w in network.start(generators(0, 1)).items()}
+    generator = torch.Generator().manual_seed(0)
+    for weight in weights.values():  # no number is 0 by chance
+        weight += 0.5 * torch.randn(weight.shape, generator=generator)
+    observations = torch.randn(2, 7, 3, generator=generator, dtype=dtype)
+    outputs, pull_back = network.vjp(weights, observations)
+    expected, torchs_pull_back = vjp(network, weights, observations)
+    slopes = [torch.randn(x.shape, generator=generator, dtype=dtype) for x in outputs]
+    found = [*outputs, *pull_back(*slopes)]
+    for ours, theirs in zip(found, [*expected, *torchs_pull_back(*slopes)], strict=True):
+        assert ours.shape == theirs.shape and theirs.any()
+        assert_close(ours, theirs, rtol)
 
 
 def test_a_saved_policy_comes_back(tmp_path):

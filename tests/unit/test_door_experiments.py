@@ -115,8 +115,8 @@ def test_the_published_settings():
     assert (ppo.learning_rate, ipo.learning_rate) == (1e-3, 5e-4)
     assert ppo.num_updates * 32 * ppo.num_steps == pytest.approx(25e6, rel=0.01)
     assert ppo.size_of_minibatches(32 * 4096) == 512
-    assert [ipo.size_of_minibatches(n * 4096) for (n,) in ipo.copies_of_players(2)] == [384, 128]
-    assert CELLS["ensemble"].settings.copies_of_players(2) == [[12, 4], [12, 4]]
+    assert [ipo.size_of_minibatches(n * 4096) for (n,) in ipo.copies(2)] == [384, 128]
+    assert CELLS["ensemble"].settings.copies(2) == [[12, 4], [12, 4]]
 
 
 @pytest.mark.parametrize(

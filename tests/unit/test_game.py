@@ -9,7 +9,7 @@ import pytest
 import torch
 from small import assert_close, general_problem, paper_problem, random_gain
 
-from ipo.game import LinearPlayers, average, domains_of_players, nash_gap, play_round
+from ipo.game import LinearPlayers, average, moves, nash_gap, play_round
 from ipo.lqr import invariant_gain, riccati_gain, training_costs
 from ipo.optimizers import make_optimizer
 
@@ -30,24 +30,25 @@ def players_at_zero(learning_rate: float = 1.0, **options) -> LinearPlayers:
 
 
 @pytest.mark.parametrize(
-    ("method", "owned"),
+    ("method", "expected"),
     [
-        ("pooled", [[0, 1, 2]]),
-        ("ipo", [[0], [1], [2]]),
-        ("ensemble", [[0, 1, 2], [0, 1, 2], [0, 1, 2]]),
+        ("pooled", [(0, [0, 1, 2])]),
+        ("ipo", [(0, [0]), (1, [1]), (2, [2])]),
+        ("ensemble", [(0, [0, 1, 2]), (1, [0, 1, 2]), (2, [0, 1, 2])]),
+        ("in_turn", [(0, [0]), (0, [1]), (0, [2])]),
     ],
 )
-def test_who_owns_which_domains(method, owned):
-    assert domains_of_players(method, 3) == owned
+def test_who_moves_on_which_domains(method, expected):
+    assert moves(method, 3) == expected
 
 
 @pytest.mark.parametrize(
     ("method", "num_domains", "message"),
     [("poled", 2, "method = 'poled'.*did you mean 'pooled'"), ("ipo", 0, "num_domains = 0: must")],
 )
-def test_ownership_that_does_not_exist(method, num_domains, message):
+def test_a_game_that_does_not_exist(method, num_domains, message):
     with pytest.raises(ValueError, match=message):
-        domains_of_players(method, num_domains)
+        moves(method, num_domains)
 
 
 # ----------------------------------------------------------------------------------- rounds
@@ -58,10 +59,10 @@ def test_ownership_that_does_not_exist(method, num_domains, message):
     [(1, False, "012"), (1, True, "p012"), (2, True, "p012012")],
 )
 def test_order_of_the_moves_in_a_round(num_inner_rounds, phi, expected):
-    moves = []
-    move_phi = partial(moves.append, "p") if phi else None
-    play_round(3, lambda d: moves.append(str(d)), num_inner_rounds, move_phi)
-    assert "".join(moves) == expected
+    made = []
+    move_phi = partial(made.append, "p") if phi else None
+    play_round(3, lambda d: made.append(str(d)), num_inner_rounds, move_phi)
+    assert "".join(made) == expected
 
 
 def test_players_step_in_order_and_feel_their_share():
@@ -81,13 +82,13 @@ def test_players_who_move_together_see_the_same_average():
 
 @pytest.mark.parametrize("order", ["in_turn", "together"])
 def test_inner_rounds_are_rounds_above_the_same_phi(order):
-    once, twice, moves = players_at_zero(order=order), players_at_zero(order=order), []
-    once.round(COSTS, num_inner_rounds=2, move_phi=lambda: moves.append(once.policy.item()))
+    once, twice, seen = players_at_zero(order=order), players_at_zero(order=order), []
+    once.round(COSTS, num_inner_rounds=2, move_phi=lambda: seen.append(once.policy.item()))
     for _ in range(2):
         twice.round(COSTS)
     assert torch.equal(once.weights, twice.weights)
     assert torch.equal(once.policy, twice.policy)
-    assert moves == [0.0]
+    assert seen == [0.0]
 
 
 def test_steps_that_solve_end_where_the_last_player_wants_the_average():

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from ipo.lqr import LQR, invariant_gain, minimum_norm_gain, project, row_space, training_costs
 from ipo.lqr_learners import (
+    LQR_CONTROLS,
     LQR_METHODS,
     LQRSettings,
     _FeedbackBehindPhi,
@@ -103,10 +104,31 @@ def slow_ipo_fixed_phi(problem: LQR, chosen: LQRSettings, r: int) -> Tensor:
     )
 
 
+def slow_in_turn(problem: LQR, chosen: LQRSettings, r: int) -> Tensor:
+    A, Ws = problem.A[r], list(problem.W_train[r])
+    K = torch.zeros(*problem.gain_shape, dtype=A.dtype, requires_grad=True)
+    optimizer = torch.optim.Adam([K], lr=chosen.learning_rate)
+    for _ in range(chosen.num_iterations):
+        for W in Ws:
+            slow_step(optimizer, straightforward.cost(K, A, W))
+    return K.detach()
+
+
+def slow_ensemble(problem: LQR, chosen: LQRSettings, r: int) -> Tensor:
+    A, Ws = problem.A[r], list(problem.W_train[r])
+    players = [torch.zeros(*problem.gain_shape, dtype=A.dtype, requires_grad=True) for _ in Ws]
+    optimizers = [torch.optim.Adam([w], lr=chosen.learning_rate) for w in players]
+    for _ in range(chosen.num_iterations):
+        for optimizer in optimizers:
+            slow_step(optimizer, pooled(sum(players) / len(Ws), A, Ws))
+    return (sum(players) / len(Ws)).detach()
+
+
 SLOW = (slow_gradient_descent, slow_overparameterized, slow_ipo_fixed_phi, slow_ipo_variable_phi)
+SLOW += (slow_in_turn, slow_ensemble)
 
 
-@pytest.mark.parametrize("slow", SLOW, ids=LQR_METHODS)
+@pytest.mark.parametrize("slow", SLOW, ids=(*LQR_METHODS, *LQR_CONTROLS))
 def test_learns_what_the_slow_version_learns(slow: Callable):
     problem = paper_problem(SEEDS)
     chosen = settings(slow.__name__.removeprefix("slow_"), num_iterations=40)

@@ -12,7 +12,7 @@ from small import DoubleNetwork, assert_close, plain_network
 from torch import Tensor
 
 from experiments.policies import load_policy, save_policy
-from ipo.networks import GridNetwork, Network, OnTable, Weights, copied
+from ipo.networks import GridNetwork, Network, OnTable, Weights, copied, in_one_row
 
 
 def generators(*seeds: int) -> list[np.random.Generator]:
@@ -72,6 +72,14 @@ def test_gradient_is_that_of_torch():
         assert_close(weights["actor1.bias"].grad[run], grads[1])
         first = plain.convolutions[0].weight.grad.permute(2, 3, 1, 0).flatten(0, 2)
         assert_close(weights["conv1.weight"].grad[run], first)
+
+
+def test_weights_in_one_row_change_together():
+    weights = GridNetwork().start(generators(0, 1))
+    row, parts = in_one_row(weights)
+    assert all(torch.equal(parts[name], weight) for name, weight in weights.items())
+    row.zero_()
+    assert len(row) == 2 and not any(part.any() for part in parts.values())
 
 
 def test_single_precision_is_near_double_precision():

@@ -23,6 +23,7 @@ from ipo.own_domains import (
 from ipo.own_domains.copies import Copies
 from ipo.own_domains.networks import ImageNetwork, VectorNetwork
 from ipo.own_domains.threads import one_thread
+from ipo.ppo import METHODS
 
 TINY = {"num_updates": 1, "num_steps": 16, "num_epochs": 1, "minibatch_size": 16}
 
@@ -90,8 +91,8 @@ def test_a_run_is_the_same_whatever_runs_are_beside_it():
 def test_controls_have_equal_frames_and_the_rates_they_are_named_after():
     for n in (2, 3, 4, 5):
         sizes = set()
-        for method in ("ppo", "ipo", "ensemble"):
-            copies = default_settings(method, n).copies_of_players(n)
+        for method in METHODS:
+            copies = default_settings(method, n).copies(n)
             sizes.add(sum(map(sum, copies)))
         assert len(sizes) == 1
     rows = compare(lines(0, 1), lines(2), seeds=[0], controls=True, num_episodes=1, **TINY)

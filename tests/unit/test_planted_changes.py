@@ -31,10 +31,10 @@ CHANGES = {
         "ipo/game.py",
         "    if move_phi is not None:  # lines 2 to 6\n        move_phi()\n"
         "    for _ in range(num_inner_rounds):  # line 7\n"
-        "        for d in range(num_players):  # line 8\n"
+        "        for d in range(num_moves):  # line 8\n"
         "            respond(d)",
         "    for _ in range(num_inner_rounds):\n"
-        "        for d in range(num_players):\n"
+        "        for d in range(num_moves):\n"
         "            respond(d)\n"
         "    if move_phi is not None:\n        move_phi()\n",
         "causality/digits",
@@ -47,8 +47,8 @@ CHANGES = {
     ),
     "ownership of an ensemble": (
         "ipo/game.py",
-        '"ensemble": [everything] * num_domains',
-        '"ensemble": [[d] for d in everything]',
+        '"ensemble": [Move(d, everything) for d in everything]',
+        '"ensemble": [Move(d, [d]) for d in everything]',
         "algorithm/ablation",
     ),
     "clip range": (
@@ -161,12 +161,12 @@ CLEAN_UPS = {
     ),
     "a loop for a comprehension": (
         "ipo/ppo.py",
-        r"    return \[g \* (scale.reshape.*) for g in gradients\]\n",
-        "    scaled = []\n"
-        "    for g in gradients:\n"
-        r"        scaled.append(g * \1)"
+        r"    columns = \[(chosen_rows.*) for x in (.*)\]\n",
+        "    columns = []\n"
+        r"    for x in \2:"
         "\n"
-        "    return scaled\n",
+        r"        columns.append(\1)"
+        "\n",
         "keys/curves",
     ),
     "an argument by name": (

@@ -20,14 +20,16 @@ from small import DoubleNetwork, assert_close, plain_network
 from torch import Tensor
 
 from experiments.keys import published
-from ipo.distributions import Categorical
+from ipo.distributions import Categorical, Gaussian
+from ipo.game import moves
 from ipo.networks import GridNetwork, OnTable, Weights, copied
 from ipo.ppo import (
     METHODS,
     PPOSettings,
     Training,
-    clip_gradients,
+    clip_gradient,
     clipped_loss,
+    loss_gradient,
     minibatches,
 )
 from ipo.rollouts import (
@@ -89,19 +91,19 @@ def of_gymnasium(
 
 def plain_runs(settings: PPOSettings, num_domains: int, seeds: Sequence[int]) -> list[list]:
     """What the plain loop makes of every run: its players after the last update."""
-    owned = settings.domains_of_players(num_domains)
+    movers, owned = zip(*settings.moves(num_domains), strict=True)
     copies = settings.num_envs // sum(map(len, owned))
     finished = []
     for r, seed in enumerate(seeds):
         draws, _, orders = streams(seed)
-        players = [plain_network(DoubleNetwork().start([draws])) for _ in owned]
+        players = [plain_network(DoubleNetwork().start([draws])) for _ in set(movers)]
         envs, firsts = [], []
         for domains in owned:
             fast = of_gymnasium(domains, [copies] * len(domains), seeds)
             num_copies = fast.envs.num_envs // len(seeds)
             firsts.append(fast.seeds[r * num_copies : (r + 1) * num_copies])
             envs.append([short_task(d) for d in domains for _ in range(copies)])
-        *_, players = plain_ppo.train(players, envs, settings, draws, orders, firsts)
+        *_, players = plain_ppo.train(players, envs, settings, draws, orders, firsts, movers=movers)
         finished.append(players)
     return finished
 
@@ -123,6 +125,7 @@ ARMS = {
     "IPO": ("ipo", 2, {}),
     "published IPO": ("ipo", 2, {"time_outs": "terminal", "skip_last_frames": True}),
     "ensemble": ("ensemble", 2, {"num_envs": 8}),
+    "one domain at a time": ("in_turn", 2, {}),
     "other numbers": (
         "ipo",
         2,
@@ -206,7 +209,7 @@ def test_same_seeds_learn_the_same(pair):
         assert all(torch.equal(ours[name], theirs[name]) for name in theirs)
 
 
-@pytest.mark.parametrize("method", ["ipo", "ensemble"])
+@pytest.mark.parametrize("method", ["ipo", "ensemble", "in_turn"])
 def test_one_domain_makes_every_method_ppo(keys, method):
     domains = TabularDomains([keys["blue"]])
     ((ppo,), (other,)) = (
@@ -216,13 +219,13 @@ def test_one_domain_makes_every_method_ppo(keys, method):
     assert all(torch.equal(ppo[name], other[name]) for name in ppo)
 
 
-def test_number_of_players_and_what_they_own():
-    assert PPOSettings("ppo").domains_of_players(3) == [[0, 1, 2]]
-    assert PPOSettings("ipo").domains_of_players(3) == [[0], [1], [2]]
-    assert PPOSettings("ensemble").domains_of_players(3) == [[0, 1, 2]] * 3
+def test_ppo_is_the_pooled_game():
+    assert PPOSettings("ppo").moves(3) == moves("pooled", 3)
 
 
-@pytest.mark.parametrize(("method", "num_players"), [("ppo", 1), ("ipo", 3), ("ensemble", 3)])
+@pytest.mark.parametrize(
+    ("method", "num_players"), [("ppo", 1), ("ipo", 3), ("ensemble", 3), ("in_turn", 1)]
+)
 def test_three_domains(keys, method, num_players):
     domains = TabularDomains([keys[color] for color in ("red", "green", "blue")])
     settings = PPOSettings(method, **(SMALL | {"num_envs": 9, "num_updates": 1}))
@@ -578,21 +581,54 @@ def test_clipped_error_of_the_value_by_hand(value, expected):
 
 def test_gradient_is_zero_where_the_ratio_is_clipped():
     batch = random_frames(num_copies=1, num_steps=5).frames()
-    logits = torch.zeros(2, 5, 7, dtype=torch.float64, requires_grad=True)
+    logits = torch.zeros(2, 5, 7, dtype=torch.float64)
     batch = batch._replace(
         log_probabilities=torch.full((2, 5), math.log(1 / 7 / 1.5)).double(),
         advantages=batch.advantages.abs(),
     )
     settings = PPOSettings("ppo", entropy_weight=0.0, value_weight=0.0)
-    clipped_loss(Categorical, logits, batch.values, batch, settings).sum().backward()
-    assert not logits.grad.any()
+    slopes = loss_gradient(Categorical, logits, batch.values, batch, settings)
+    assert not any(slope.any() for slope in slopes)
+
+
+@pytest.mark.parametrize("distribution", [Categorical, Gaussian])
+@pytest.mark.parametrize("dtype, rtol", [(torch.float64, 1e-12), (torch.float32, 1e-5)])
+@pytest.mark.parametrize("normalize", ["none", "minibatch"])
+def test_gradient_of_the_loss_is_that_of_torch(distribution, dtype, rtol, normalize):
+    """On frames of which many are clipped, in the ratio, in the value, in both and in neither."""
+    generator = torch.Generator().manual_seed(0)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(2, 400, *shape, generator=generator, dtype=dtype)
+
+    parameters, values = normal(6), normal()
+    actions = normal(3)
+    if distribution is Categorical:
+        actions = actions.abs().argmax(-1)
+    else:
+        parameters[..., 3:].exp_()
+    old = distribution.log_probability(parameters, actions) + 0.3 * normal()
+    batch = Rollout(values, actions, old, values + 0.3 * normal(), normal(), normal())
+    settings = PPOSettings("ppo", normalize_advantages=normalize)
+    leaves = [x.clone().requires_grad_() for x in (parameters, values)]
+    loss = clipped_loss(distribution, *leaves, batch, settings)
+    expected = torch.autograd.grad(loss.sum(), leaves)
+    found = loss_gradient(distribution, parameters, values, batch, settings)
+    for ours, theirs in zip(found, expected, strict=True):
+        constant = ours == 0  # where the entropy has no say: in the values
+        assert_close(ours, theirs, rtol)
+    assert 0.1 < constant.double().mean() < 0.9
 
 
 @pytest.mark.parametrize("max_norm", [0.1, 0.5, 1000.0])
 def test_gradients_are_clipped_run_by_run(max_norm):
     rng = np.random.default_rng(0)
     gradients = [torch.tensor(rng.normal(size=(3, *shape))) for shape in ((4, 5), (5,), (2, 1, 2))]
-    clipped = clip_gradients(gradients, max_norm)
+    in_rows = clip_gradient(torch.cat([g.flatten(1) for g in gradients], 1), max_norm)
+    clipped = [
+        part.reshape(own.shape)
+        for part, own in zip(in_rows.split([20, 5, 4], 1), gradients, strict=True)
+    ]
     for run in range(3):
         leaves = [torch.zeros(g.shape[1:], dtype=g.dtype, requires_grad=True) for g in gradients]
         for leaf, gradient in zip(leaves, gradients, strict=True):
@@ -603,8 +639,7 @@ def test_gradients_are_clipped_run_by_run(max_norm):
 
 
 def test_no_gradient_stays_no_gradient():
-    (clipped,) = clip_gradients([torch.zeros(2, 3)], 0.5)
-    assert clipped.tolist() == [[0, 0, 0]] * 2
+    assert clip_gradient(torch.zeros(2, 3), 0.5).tolist() == [[0, 0, 0]] * 2
 
 
 # -------------------------------------------------------------------------- minibatches
@@ -623,7 +658,8 @@ def test_minibatches_are_a_partition(seed, num_copies, num_steps, skip, data):
     settings = PPOSettings("ppo", num_steps=num_steps, minibatch_size=size)
     frames = random_frames(num_runs=3, num_copies=num_copies, num_steps=num_steps).frames()
     generators = [np.random.default_rng([seed, run]) for run in range(3)]
-    batches = list(minibatches(frames, settings, generators, skip))
+    numbers = torch.arange(num_frames).expand(3, -1)
+    batches = [x for _, (x,) in minibatches(frames, [numbers], settings, generators, skip)]
     expected = {n * num_steps + t for n in range(num_copies) for t in range(num_steps - skip)}
     assert all(batch.shape == (3, size) for batch in batches[:-1])
     for run in range(3):
@@ -634,10 +670,16 @@ def test_minibatches_are_a_partition(seed, num_copies, num_steps, skip, data):
 def test_runs_have_orders_of_their_own():
     settings = PPOSettings("ppo", num_steps=10, minibatch_size=40)
     frames = random_frames(num_steps=10).frames()
-    (order,) = minibatches(frames, settings, [np.random.default_rng(r) for r in range(2)], False)
-    assert not torch.equal(order[0], order[1])
-    (alone,) = minibatches(frames, settings, [np.random.default_rng(1)], False)
-    assert torch.equal(order[1], alone[0])
+    numbers = torch.arange(40).expand(2, -1)
+
+    def order(*seeds: int) -> Tensor:
+        generators = [np.random.default_rng(seed) for seed in seeds]
+        ((_, (chosen,)),) = minibatches(frames, [numbers], settings, generators, False)
+        return chosen
+
+    together = order(0, 1)
+    assert not torch.equal(together[0], together[1])
+    assert torch.equal(together[1], order(1, 1)[0])
 
 
 @pytest.mark.parametrize("num_epochs", [1, 2, 3, 4])
@@ -666,7 +708,7 @@ def test_every_second_epoch_leaves_out_the_last_frames(num_epochs):
 
     norms: list[float] = []
     training = in_training(settings)
-    training.optimizers[0] = Watched(list(training.players[0].values()), 1e-9)
+    training.optimizers[0] = Watched([training.rows[0]], 1e-9)
     training.improve(0, rollout.frames())
     assert [norm > 0 for norm in norms] == [True, False, True, False][:num_epochs]
 

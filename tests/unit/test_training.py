@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ipo.distributions import Gaussian
 from ipo.networks import DenseNetwork, copied
-from ipo.ppo import PPOSettings, Training
+from ipo.ppo import METHODS, PPOSettings, Training
 from ipo.rollouts import Collector, FromGymnasium, RewardNormalizer, Step
 
 SMALL = {"num_envs": 4, "num_steps": 16, "minibatch_size": 16, "num_updates": 4, "num_epochs": 2}
@@ -140,10 +140,11 @@ def test_rewards_are_normalised_as_step_by_step_and_piece_by_piece():
         ("ppo", (24, 8), [[24, 8]]),
         ("ipo", (24, 8), [[24], [8]]),
         ("ensemble", (24, 8), [[12, 4], [12, 4]]),
+        ("in_turn", (24, 8), [[24], [8]]),
     ],
 )
 def test_copies_are_shared_among_players(method, num_envs, copies):
-    assert PPOSettings(method, num_envs=num_envs).copies_of_players(2) == copies
+    assert PPOSettings(method, num_envs=num_envs).copies(2) == copies
 
 
 def test_players_with_unequal_rollouts_make_the_same_number_of_steps():
@@ -178,7 +179,7 @@ def flat(training: Training) -> Tensor:
     return torch.cat([w.detach().flatten() for p in training.players for w in p.values()])
 
 
-@pytest.mark.parametrize("method", ["ppo", "ipo", "ensemble"])
+@pytest.mark.parametrize("method", METHODS)
 def test_a_restored_training_goes_on_as_if_nothing_had_happened(method):
     changes = {"normalize_rewards": True, "normalize_advantages": "rollout", "num_steps": 18}
     settings = PPOSettings(method, **(SMALL | changes))
@@ -195,6 +196,18 @@ def test_a_restored_training_goes_on_as_if_nothing_had_happened(method):
     assert torch.equal(flat(second), flat(whole))
     assert second.num_frames == whole.num_frames == 4 * 4 * 18
     assert not torch.equal(flat(first), flat(whole))
+
+
+def test_moments_of_each_weight_as_they_once_were_are_refused():
+    training = trainings(PPOSettings("ppo", **SMALL))
+    training.update()
+    state = training.state()
+    zeros = [torch.zeros_like(w) for w in training.players[0].values()]
+    state["optimizers"][0] = [
+        {"step": torch.tensor(1.0), "exp_avg": zero, "exp_avg_sq": zero} for zero in zeros
+    ]
+    with pytest.raises(ValueError, match="moments of shapes"):
+        training.restore(state)
 
 
 @pytest.mark.parametrize("d", [0, 1])

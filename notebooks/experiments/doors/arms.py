@@ -8,14 +8,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
 from experiments.doors import training as door_training
 from experiments.doors.success import Cell
 from experiments.store import select
 from experiments.tables import mean_and_std
-from ipo.stats import bootstrap_interval
+from ipo.stats import mean_interval
 
 NAMES = {
     "ppo_half": "PPO, half",
@@ -90,6 +89,6 @@ def percent(values: pd.Series) -> str:
 
 
 def percent_with_interval(values: pd.Series) -> str:
-    """Mean over runs with its 95 % bootstrap interval."""
-    low, high = bootstrap_interval(100 * values.to_numpy(), np.random.default_rng(0))
+    """Mean over runs with its 95 % interval."""
+    low, high = mean_interval(100 * values.to_numpy())
     return f"{100 * values.mean():.1f} [{low:.0f}, {high:.0f}]"

@@ -74,7 +74,8 @@ class Cell:
     @property
     def num_players(self) -> int:
         """How many networks a policy averages."""
-        return len(self.trained.settings.domains_of_players(len(TRAIN_FRICTIONS)))
+        moves = self.trained.settings.moves(len(TRAIN_FRICTIONS))
+        return len({move.player for move in moves})
 
     @property
     def columns(self) -> dict[str, Any]:

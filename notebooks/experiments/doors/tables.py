@@ -13,7 +13,6 @@ from typing import Any
 import joblib
 import numpy as np
 import pandas as pd
-import scipy.stats
 
 from experiments.doors.arms import (
     NAMES,
@@ -36,7 +35,6 @@ PAIRS = {
     "longer_ppo": ("ppo", "ppo_half"),
     "longer_ipo": ("ipo", "ipo_half"),
 }
-SAME_RUNS = ("longer_ppo", "longer_ipo")  # later
 
 
 def training_numbers(curves: pd.DataFrame, arms: Mapping[str, Cell]) -> dict[str, float]:
@@ -128,7 +126,6 @@ def comparisons(
     success: pd.DataFrame,
     arms: Mapping[str, Cell],
     tested: Sequence[float],
-    rng: np.random.Generator,
 ) -> pd.DataFrame:
     """How many points more an arm opens than another, over all test frictions and at the hardest.
 
@@ -140,21 +137,17 @@ def comparisons(
     for pair, (arm, other) in PAIRS.items():
         for place, (frictions, text) in places.items():
             values, base = (mean_rate(success, arms[name], frictions) for name in (arm, other))
-            mean, low, high = paired_difference(100 * values, 100 * base, rng)
-            if pair in SAME_RUNS:
-                p = scipy.stats.ttest_rel(values, base).pvalue
-            else:
-                p = scipy.stats.ttest_ind(values, base, equal_var=False).pvalue
+            found = paired_difference(100 * values, 100 * base)
             rows.append(
                 {
                     "key": f"{pair}_{place}",
                     "difference": f"{NAMES[arm]} − {NAMES[other]}",
                     "frictions": text,
-                    "mean": mean,
-                    "95 %": f"[{low:+.1f}, {high:+.1f}]",
+                    "mean": found.mean,
+                    "95 %": f"[{found.low:+.1f}, {found.high:+.1f}]",
                     # The statistic is for costs, of which less is better.
                     "P(better)": probability_of_improvement(-values, -base),
-                    "p": p,
+                    "p": found.p,
                 }
             )
     return pd.DataFrame(rows)
