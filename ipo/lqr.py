@@ -187,7 +187,8 @@ def feedback_costs(F: Tensor, problem: LQR) -> Tensor:
     """The cost of ``a = -F s``, F ``[R, n_u, n_x]`` or ``[R, E, n_u, n_x]``; unchecked."""
     systems = [problem.A, problem.B, problem.Q, problem.R]
     if F.dim() == 4:
-        systems = [matrix.repeat_interleave(F.shape[1], dim=0) for matrix in systems]
+        E = F.shape[1]
+        systems = [x.unsqueeze(1).expand(-1, E, -1, -1).flatten(0, 1) for x in systems]
     return _StateFeedbackCost.apply(F.flatten(0, -3), *systems).unflatten(0, F.shape[:-2])
 
 
@@ -223,20 +224,21 @@ def _lyapunov_pair(M: Tensor, C: Tensor) -> tuple[Tensor, Tensor]:
     Stops when the next terms are below rounding, which takes 4 to 10 doublings.
 
     Returns:
-        P, S ``[..., n, n]``. Where the series do not end, P is infinite and S is NaN: the cost
+        P, S ``[systems, n, n]``. Where a series does not end, P is infinite and S is NaN: the cost
         is infinite and has no gradient.
     """
     X = torch.cat([C, torch.eye(M.shape[-1], dtype=M.dtype).expand_as(C)])
     Y = torch.cat([M, M.mT])  # the second equation is the first one of M'
-    negligible = math.sqrt(torch.finfo(M.dtype).eps)
+    negligible = math.sqrt(torch.finfo(M.dtype).eps) / 4
     for _ in range(MAX_DOUBLINGS):
         X = torch.baddbmm(X, torch.bmm(Y.mT, X), Y)
         Y = torch.bmm(Y, Y)
-        if float(torch.linalg.vector_norm(Y)) < negligible:  # of all systems together
+        size = torch.linalg.vector_norm(Y[: len(M)], dim=(-2, -1))
+        if float(size.max()) < negligible:
             P, S = X.chunk(2)
             return P, S
     P, S = X.chunk(2)
-    endless = ~(torch.linalg.vector_norm(Y[: len(M)], dim=(-2, -1)) < negligible)
+    endless = ~(size < negligible)
     P[endless], S[endless] = math.inf, math.nan
     return P, S
 

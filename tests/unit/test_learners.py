@@ -11,7 +11,14 @@ from small import assert_close, paper_problem, random_gain, trained_gain
 from torch import Tensor
 
 from ipo.lqr import LQR, invariant_gain, minimum_norm_gain, project, row_space, training_costs
-from ipo.lqr_learners import LQR_CONTROLS, LQR_METHODS, LQRSettings, published_lqr, train
+from ipo.lqr_learners import (
+    LQR_CONTROLS,
+    LQR_METHODS,
+    LQRSettings,
+    _FeedbackBehindPhi,
+    published_lqr,
+    train,
+)
 from ipo.optimizers import descend, make_optimizer
 
 SEEDS = [0, 1]
@@ -294,3 +301,15 @@ def test_published_settings_are_the_papers(method):
     assert (chosen.method, chosen.optimizer) == (method, "adam")
     assert (chosen.learning_rate, chosen.num_iterations, chosen.num_hidden) == (rate, 5000, 200)
     assert (chosen.weight_decay, chosen.max_gradient_norm) == (0, None)
+
+
+def test_feedback_behind_phi_is_the_product_with_its_gradient():
+    Phi, K, W = (torch.randn(2, *size).double() for size in ((3, 5), (2, 3), (5, 4)))
+    Phi.requires_grad_()
+    assert_close(_FeedbackBehindPhi.apply(Phi, K, W, Phi.detach() @ W), K @ Phi.detach() @ W)
+    grad_F = torch.randn(2, 2, 4).double()
+    ours, plain = (
+        torch.autograd.grad(F, Phi, grad_F)[0]
+        for F in (_FeedbackBehindPhi.apply(Phi, K, W, Phi.detach() @ W), K @ Phi @ W)
+    )
+    assert_close(ours, plain)
