@@ -74,7 +74,7 @@ def train_policy(
     device: Device = "cpu",
     **changes: Any,
 ) -> Policy:
-    """Train one policy for each seed by ``ppo``, ``ipo`` or ``ensemble``.
+    """Train one policy for each seed by ``ppo``, ``ipo``, ``ensemble`` or ``in_turn``.
 
     Args:
         domains: name -> function that makes an environment; the training domains.
