@@ -157,9 +157,10 @@ def compare(
 ) -> pd.DataFrame:
     """PPO and IPO side by side: rows of every method, run and domain.
 
-    Both see the same number of frames. With ``controls`` there are three more methods, which
-    separate what IPO changes at once: PPO with IPO's learning rate, IPO with PPO's, and an
-    ensemble with IPO's players, average and learning rate, in which every player owns all domains.
+    Both see the same number of frames. With ``controls`` there are four more methods, which
+    separate what IPO changes at once: PPO with IPO's learning rate, IPO with PPO's, an ensemble
+    with IPO's players, average and learning rate, in which every player owns all domains, and one
+    network that learns from one domain at a time, without players.
     """
     import pandas as pd
 
@@ -174,6 +175,7 @@ def compare(
             f"ppo_lr{IPO_RATE:g}": ("ppo", IPO_RATE),
             f"ipo_lr{PPO_RATE:g}": ("ipo", PPO_RATE),
             "ensemble": ("ensemble", IPO_RATE),
+            "in_turn": ("in_turn", IPO_RATE),
         }
     parts = []
     for label, (method, rate) in arms.items():

@@ -96,7 +96,14 @@ def test_controls_have_equal_frames_and_the_rates_they_are_named_after():
             sizes.add(sum(map(sum, copies)))
         assert len(sizes) == 1
     rows = compare(lines(0, 1), lines(2), seeds=[0], controls=True, num_episodes=1, **TINY)
-    assert set(rows["method"]) == {"ppo", "ipo", "ppo_lr0.0005", "ipo_lr0.001", "ensemble"}
+    assert set(rows["method"]) == {
+        "ppo",
+        "ipo",
+        "ppo_lr0.0005",
+        "ipo_lr0.001",
+        "ensemble",
+        "in_turn",
+    }
     assert set(rows["domain"]) == {"line 0", "line 1", "line 2"}
     without = compare(lines(0, 1), lines(2), seeds=[0], num_episodes=1, **TINY)
     assert set(without["method"]) == {"ppo", "ipo"}
