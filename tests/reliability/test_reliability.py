@@ -29,8 +29,8 @@ def generator() -> np.random.Generator:
         if kind != "bits without a seal"
     ],
 )
-def test_nothing_is_lost(kind, tmp_path):
-    for row in count_faults.rows(kind, 0.05, tmp_path):
+def test_nothing_is_lost(kind):
+    for row in count_faults.rows(kind, 0.05):
         assert row["lost"] == 0, row
 
 
