@@ -50,7 +50,8 @@ class Steps:
 
     def run(self) -> None:
         steps = self._read()
-        for number in range(len(steps) - self.again, 40):
+        steps += steps[-1:] if self.again else []
+        for number in range(len(steps), 40):
             steps.append(number)
             self._write(steps)
             time.sleep(0.01)
