@@ -33,16 +33,15 @@ SEED = 20261127
 KINDS = disturbed.KINDS | damaged.KINDS  # by name: rows of (fault, where, tries, outcomes)
 
 
-def rows(kind: str, tries: float, scratch: Path) -> Iterator[dict[str, Any]]:
+def rows(kind: str, tries: float) -> Iterator[dict[str, Any]]:
     """The table's rows of one kind of fault, with so many times the usual tries, at least one."""
     today = datetime.datetime.now(datetime.UTC).date()
     for fault, where, num, outcomes in KINDS[kind]:
-        name = f"{kind} {where}"
-        generator = np.random.default_rng([SEED, zlib.crc32(name.encode())])
-        folder = scratch / name.replace(" ", "_").replace("/", "_")
-        found = list(outcomes(folder, generator, math.ceil(num * tries)))
+        generator = np.random.default_rng([SEED, zlib.crc32(f"{kind} {where}".encode())])
+        with TemporaryDirectory() as scratch:
+            found = list(outcomes(Path(scratch) / "job", generator, math.ceil(num * tries)))
         made = {"commit": commit(), "date": today.isoformat(), "machine": machine()}
-        yield {"kind": kind, **count(fault, where, found), **made}
+        yield {**count(fault, where, found), **made}
 
 
 def main() -> None:
@@ -54,18 +53,17 @@ def main() -> None:
     if unknown := set(options.kinds) - KINDS.keys():
         parser.error(f"no kind of fault is called {', '.join(sorted(unknown))}")
     for kind in options.kinds or KINDS:
-        with TemporaryDirectory() as scratch:
-            for row in rows(kind, options.tries, Path(scratch)):
-                print(", ".join(f"{key} {value}" for key, value in row.items()), flush=True)
-                if options.json:
-                    keep(options.json, row)
+        for row in rows(kind, options.tries):
+            print(", ".join(f"{key} {value}" for key, value in row.items()), flush=True)
+            if options.json:
+                keep(options.json, row)
 
 
 def keep(path: Path, row: dict[str, Any]) -> None:
     """Put a row in the file, in the place of the one of the same fault and place."""
     record = read_record(path) if path.exists() else {"rows": []}
-    found = {(r["kind"], r["where"]): r for r in [*record["rows"], row]}
-    order = {(kind, where): None for kind, parts in KINDS.items() for _, where, *_ in parts}
+    found = {(r["fault"], r["where"]): r for r in [*record["rows"], row]}
+    order = [(fault, where) for parts in KINDS.values() for fault, where, *_ in parts]
     write_record(path, {"seed": SEED, "rows": [found[key] for key in order if key in found]})
 
 

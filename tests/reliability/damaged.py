@@ -17,9 +17,11 @@ from typing import Any
 from unittest import mock
 
 import numpy as np
+import pytest
 import torch
 from faults import HARMLESS, HELD
 from jobs import ROOT, Build
+from toy_book import in_toy
 
 import claims
 import website
@@ -81,11 +83,12 @@ def read_executed(path: Path) -> str:
 def read_site(path: Path) -> str:
     """A page, where a damaged site is built anew."""
     root = next(parent for parent in path.parents if (parent / "_toc.yml").exists())
-    again = mock.Mock(side_effect=BuildError(f"{path} is built anew"))
-    with mock.patch.object(website, "run_jupyter_book", again):
-        built = root / "book" / "_build"
+    with pytest.MonkeyPatch.context() as patch:
+        in_toy(patch, root)
+        again = mock.Mock(side_effect=BuildError(f"{path} is built anew"))
+        patch.setattr(website, "run_jupyter_book", again)
         notebooks = load_notebooks(root, "class", root / "book" / "_executed" / "class")
-        website.build_site(root, built, notebooks, "class")
+        website.build_site(root, root / "book" / "_build", notebooks, "class")
     return "current"
 
 
