@@ -69,7 +69,7 @@ def costs(rows: pd.DataFrame, by: str, **fixed: int) -> pd.DataFrame:
     """Cost in a new domain, mean ± standard deviation over runs, by arm and ``by``."""
     chosen = select(rows, {"metric": "test_cost", "optimizer": "adam", **fixed})
     table = chosen.groupby(["method", by])["value"].agg(mean_and_std).unstack()
-    return table.reindex(list(ARMS)).rename(index=ARMS).rename_axis(index=None)
+    return table.reindex(list(ARMS)).fillna("").rename(index=ARMS).rename_axis(index=None)
 
 
 def recovered(rows: pd.DataFrame) -> pd.DataFrame:
