@@ -68,8 +68,9 @@ def arms(num_domains: int, dim_distractor: int, num_iterations: int) -> list[Cel
 def costs(rows: pd.DataFrame, by: str, **fixed: int) -> pd.DataFrame:
     """Cost in a new domain, mean ± standard deviation over runs, by arm and ``by``."""
     chosen = select(rows, {"metric": "test_cost", "optimizer": "adam", **fixed})
-    table = chosen.groupby(["method", by])["value"].agg(mean_and_std).unstack()
-    return table.reindex(list(ARMS)).fillna("").rename(index=ARMS).rename_axis(index=None)
+    table = chosen.groupby(["method", by])["value"].agg(mean_and_std).unstack().reindex(list(ARMS))
+    table = table.fillna("").rename(index=ARMS)
+    return table.rename_axis(index=None, columns=by.replace("_", " "))
 
 
 def recovered(rows: pd.DataFrame) -> pd.DataFrame:
