@@ -32,10 +32,10 @@ ROW_COLUMNS = ["method", "run", "domain", "metric", "value"]
 BADGES = {  # colours of the verdicts, in the order in which they are counted
     REPRODUCED: "success",
     IN_PART: "warning",
-    UNDECIDED: "light",
+    UNDECIDED: "secondary",
     EXPLAINED: "info",
     CONTRADICTED: "danger",
-    NO_DATA: "secondary",
+    NO_DATA: "light",
 }
 
 

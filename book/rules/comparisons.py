@@ -135,12 +135,13 @@ def because_of_the_game(
     Where there is no advantage, there is nothing to explain, and the verdict is that on it. Of a
     run, the mean over the places counts, or, where ``each`` is asked for, every place by itself.
     """
-    compared = [
-        advantage_and_left(
-            cells, paper, common, group, [method, baseline, *control], lower_is_better
-        )
-        for group in ([[place] for place in places] if each else [places])
-    ]
+
+    def at(group: list[dict[str, Any]]) -> tuple[Compared, Compared]:
+        arms = [method, baseline, *control]
+        return advantage_and_left(cells, paper, common, group, arms, lower_is_better)
+
+    single = [[place] for place in places]
+    compared = [at(group) for group in (single if each else [places])]
     verdicts = [remaining(*own, share) for own in compared]
     ours, theirs, controlled, left_over = (
         f"{label(arm['method'])}{suffix(arm)}" for arm in (method, baseline, *control)
@@ -154,7 +155,11 @@ def because_of_the_game(
         parts = [f"{words(place)}: {part}" for place, part in zip(places, parts, strict=True)]
         parts[0] = f"{counted(verdicts)}; {parts[0]}"
     elif len(places) > 1:
-        parts[0] = f"in the mean over {len(places)} configurations {parts[0]}"
+        by_place = [at(group)[1].difference.mean for group in single]
+        parts = [
+            f"in the mean over {len(places)} configurations {parts[0]}; by configuration, from "
+            f"{min(by_place):+.1f} to {max(by_place):+.1f} is left"
+        ]
     return Finding(together(verdicts), "; ".join(parts))
 
 
