@@ -14,7 +14,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from faults import HELD, Job, differs, ended, kill, killed, said, start, whole
+from faults import HELD, Job, differs, ended, kill, killed, said, start, wait, whole
 from jobs import Build, DoorTraining, Reproduce, Sweep, left
 
 from chapters import tree_hash
@@ -69,7 +69,7 @@ def on_full_disk(job: Job, generator: np.random.Generator, num: int) -> Iterator
         filler.write_bytes(bytes(free))
         program, seen = start(job), set()
         while program.exitcode is None:
-            program.join(0.5)
+            wait(program, 0.5)
             seen |= job.seen()
         unfinished, lost = left(job.folder), len(seen - job.seen())
         filler.unlink()
@@ -112,7 +112,7 @@ def on_read_only_disk(job: Job, generator: np.random.Generator, num: int) -> Ite
 def _stop(job: Job, seconds: float) -> None:
     """A job that is killed after some seconds, if it has not ended."""
     program = start(job)
-    program.join(seconds)
+    wait(program, seconds)
     if program.exitcode is None:
         kill(program, signal.SIGKILL, whole_tree=True)
 

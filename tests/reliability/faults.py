@@ -88,6 +88,13 @@ def ended(job: Job) -> Any:
     return job.result()
 
 
+def wait(process: multiprocessing.Process, seconds: float) -> None:
+    """Wait so long, or until it has ended; ``join`` would not come back where it is a program."""
+    deadline = time.monotonic() + seconds
+    while process.exitcode is None and (left := deadline - time.monotonic()) > 0:
+        time.sleep(min(left, 0.02))
+
+
 def said(process: multiprocessing.Process) -> str:
     process.log.seek(0)
     return process.log.read()
@@ -101,7 +108,7 @@ def kill(process: multiprocessing.Process, how: int, whole_tree: bool) -> str | 
     for victim in victims:
         with contextlib.suppress(psutil.NoSuchProcess):  # one of the short ones
             victim.send_signal(how)
-    process.join(SECONDS_TO_END)
+    wait(process, SECONDS_TO_END)
     if process.exitcode is None:
         process.kill()
         return "did not end"
@@ -145,7 +152,7 @@ def killed(
     num_before = 0  # outcomes when this job began
     while len(outcomes) < num:
         process = start(job)
-        process.join(generator.uniform(0, seconds))
+        wait(process, generator.uniform(0, seconds))
         before = job.seen()
         if process.exitcode is None:
             problem = kill(process, how, bool(generator.integers(2)) and how == signal.SIGKILL)
