@@ -32,7 +32,7 @@ ROW_COLUMNS = ["method", "run", "domain", "metric", "value"]
 BADGES = {  # colours of the verdicts, in the order in which they are counted
     REPRODUCED: "success",
     IN_PART: "warning",
-    UNDECIDED: "secondary",
+    UNDECIDED: "muted",
     EXPLAINED: "info",
     CONTRADICTED: "danger",
     NO_DATA: "light",

@@ -140,6 +140,8 @@ def by_method(
 
 def chosen_by(rows: pd.DataFrame, criterion: str) -> pd.DataFrame:
     """The rows of the penalty with the lowest ``criterion``: each run chooses by itself."""
+    if len(rows):  # without rows, nothing is chosen
+        check_choice("criterion", criterion, rows["metric"].unique().tolist())
     keys = ["problem", "method", "run"]
     scores = rows[rows["metric"] == criterion].sort_values("value", kind="stable")
     best = scores.drop_duplicates(keys)[[*keys, "penalty"]]

@@ -690,6 +690,12 @@ def rows_of_tables() -> Iterator[Row]:
         names=OBJECT[::2],
         digits=NATURAL,
     )
+    yield row(
+        tables.chosen_by,
+        {"rows": rows.assign(problem="p", penalty=1.0), "criterion": "cost"},
+        rows="whatever is in them is chosen from, or nothing",
+        criterion=CHOICE,
+    )
     pair = {"recorded": rows, "rows": rows}
     yield row(side_by_side, pair, recorded=OBJECT + bad("sample size", rows[:0]), rows=OBJECT)
 

@@ -358,7 +358,7 @@ def batches(name: str) -> list[Batch]:
 
 def settings_of(label: str, color_encoding: str) -> dict:
     """The settings that an arm's name stands for."""
-    method = label.split("_")[0]
+    method = "in_turn" if label.startswith("in_turn") else label.split("_")[0]
     learning_rate = LEARNING_RATES.get(label, LEARNING_RATES[method])
     normalize = "minibatch" if label.endswith("_normalized") else "none"
     settings = published(method, learning_rate=learning_rate, normalize_advantages=normalize)
