@@ -8,8 +8,8 @@ import numpy as np
 import pandas as pd
 import scipy.stats
 
+from experiments.doors.pulling import strategy_of_part, strategy_of_policy
 from ipo.stats import mean_interval
-from ipo.worlds.pulling import strategy_of_part, strategy_of_policy
 from rules.cells import Cells, NoData, label, shown, with_interval
 from rules.verdicts import (
     UNDECIDED,
