@@ -2,22 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from experiments.registry import DATA
 from experiments.sealed import read_record
 
 RECORD = DATA / "bench" / "own_domains.json"
 
 
-def write_fragment(folder: Path) -> None:
-    """Writes ``_generated/own_domains.md`` under ``folder``."""
-    target = Path(folder) / "_generated"
-    target.mkdir(parents=True, exist_ok=True)
-    (target / "own_domains.md").write_text(table(), encoding="utf-8")
-
-
-def table() -> str:
+def overview() -> str:
     record = read_record(RECORD)
     lines = ["| Environment | | Frames per CPU second | Return |", "|:--|:--|--:|--:|"]
     for row in record["rows"]:

@@ -14,6 +14,7 @@ import yaml
 
 from experiments.paper import read_paper
 from experiments.store import Store
+from fragments import write_fragment
 from rules import (
     CONTRADICTED,
     EXPLAINED,
@@ -118,10 +119,8 @@ def write_fragments(folder: Path, data: Path = DATA) -> None:
         for key, chapter in book["chapters"].items()
         if "headline" in chapter
     }
-    target = Path(folder) / "_generated"
-    target.mkdir(parents=True, exist_ok=True)
-    (target / "found.md").write_text(overview(book, findings, numbers), encoding="utf-8")
-    (target / "claims.md").write_text(full_list(book, findings), encoding="utf-8")
+    write_fragment(folder, "found", overview(book, findings, numbers))
+    write_fragment(folder, "claims", full_list(book, findings))
 
 
 def overview(

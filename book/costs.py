@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from itertools import groupby
-from pathlib import Path
 
 import pandas as pd
 
@@ -15,13 +14,11 @@ CORES = (1, 2, 4, 8, 16, 32, 64)
 SCALING = DATA / "bench" / "scaling.json"
 
 
-def write_fragment(folder: Path) -> None:
-    """Writes ``_generated/costs.md`` under ``folder``."""
-    target = Path(folder) / "_generated"
-    target.mkdir(parents=True, exist_ok=True)
+def overview() -> str:
+    """Both tables, with what lies between them in words."""
     bench = read_record(SCALING)
-    text = "\n\n".join([core_hours(), scaling(bench), wall_hours(bench), limits(bench)])
-    (target / "costs.md").write_text(text + "\n", encoding="utf-8")
+    text = [core_hours(), scaling(bench), wall_hours(bench), limits(bench)]
+    return "\n\n".join(text) + "\n"
 
 
 def core_hours() -> str:

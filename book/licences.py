@@ -16,13 +16,6 @@ NOTICES = (
 )
 
 
-def write_fragment(folder: Path) -> None:
-    """Writes ``_generated/licences.md`` under ``folder``."""
-    target = Path(folder) / "_generated"
-    target.mkdir(parents=True, exist_ok=True)
-    (target / "licences.md").write_text(overview(), encoding="utf-8")
-
-
 def overview() -> str:
     lines = ["| In the pages | Comes with | Licence |", "|:--|:--|:--|", mathjax()]
     lines += [notice(package, name) for package, name in NOTICES]

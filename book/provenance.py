@@ -3,19 +3,11 @@
 from __future__ import annotations
 
 from collections import Counter
-from pathlib import Path
 
 from experiments.confirm import confirmed, title
 from experiments.registry import CHAPTERS, DATA
 from experiments.store import Batch, Store
 from experiments.witness import WITNESS, Slice
-
-
-def write_fragment(folder: Path) -> None:
-    """Writes ``_generated/provenance.md`` under ``folder``."""
-    target = Path(folder) / "_generated"
-    target.mkdir(parents=True, exist_ok=True)
-    (target / "provenance.md").write_text(overview(), encoding="utf-8")
 
 
 def overview() -> str:

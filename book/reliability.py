@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pandas as pd
 
 from costs import in_markdown
@@ -15,13 +13,6 @@ RECORD = DATA / "bench" / "reliability.json"
 COLUMNS = {"fault": "Fault", "where": "In", "tried": "Tried"} | {
     name: name.capitalize() for name in ("held", "harmless", "lost")
 }
-
-
-def write_fragment(folder: Path) -> None:
-    """Writes ``_generated/reliability.md`` under ``folder``."""
-    target = Path(folder) / "_generated"
-    target.mkdir(parents=True, exist_ok=True)
-    (target / "reliability.md").write_text(overview(), encoding="utf-8")
 
 
 def overview() -> str:

@@ -19,8 +19,16 @@ import reliability
 from chapters import Notebook, tree_hash
 from experiments.files import replace_text
 from experiments.orphans import python
+from fragments import write_fragment
 from messages import BuildError, for_terminal
 
+GENERATED = {  # text from what is recorded, and from the packages that are installed
+    "provenance": provenance,
+    "reliability": reliability,
+    "own_domains": benchmarks,
+    "costs": costs,
+    "licences": licences,
+}
 NUM_SLOWEST_CELLS = 8
 JUPYTER_BOOK = "from jupyter_book.cli.main import main; main()"
 
@@ -52,13 +60,9 @@ def stage(root: Path, source: Path, notebooks: list[Notebook], profile: str) -> 
     for notebook in notebooks:
         nbformat.write(notebook.read_executed(), source / f"{notebook.name}.ipynb")
     claims.write_fragments(source)
-    provenance.write_fragment(source)
-    reliability.write_fragment(source)
-    benchmarks.write_fragment(source)
-    costs.write_fragment(source)
-    licences.write_fragment(source)
-    run_times = source / "_generated" / "run_times.md"
-    run_times.write_text(run_times_tables(notebooks, profile), encoding="utf-8")
+    for name, page in GENERATED.items():
+        write_fragment(source, name, page.overview())
+    write_fragment(source, "run_times", run_times_tables(notebooks, profile))
 
 
 def run_jupyter_book(source: Path, output: Path) -> Path:

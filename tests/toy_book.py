@@ -73,4 +73,4 @@ def in_toy(patch: pytest.MonkeyPatch, root: Path) -> None:
     patch.setattr(sources, "PACKAGES", {"ipo": root / "ipo"})
     patch.setattr(claims, "write_fragments", lambda folder: None)
     for page in (provenance, costs):
-        patch.setattr(page, "write_fragment", lambda folder: None)
+        patch.setattr(page, "overview", lambda: "")

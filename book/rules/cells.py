@@ -95,9 +95,15 @@ def label(method: str) -> str:
     return NAMES.get(method, method.replace("_", " "))
 
 
-def shown(number: float) -> str:
-    """One decimal, a true minus sign, and no negative zero."""
-    return f"{number:z.1f}".replace("-", "−")
+def shown(number: float, spec: str = "z.1f") -> str:
+    """By a format, with a true minus sign; one decimal and no negative zero unless it is given."""
+    return format(number, spec).replace("-", "−")
+
+
+def with_interval(mean: float, low: float, high: float, digits: int = 3) -> str:
+    """An effect and its 95 % interval, with their signs."""
+    effect, *ends = (shown(number, f"+.{digits}f") for number in (mean, low, high))
+    return f"{effect}, 95 % interval [{', '.join(ends)}]"
 
 
 def paper_tests(paper: pd.DataFrame, method: str, baseline: str, num_runs: int) -> str:

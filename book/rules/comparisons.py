@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import scipy.stats
 
-from rules.cells import Cells, label, paper_effect, paper_tests, published
+from rules.cells import Cells, label, paper_effect, paper_tests, published, shown
 from rules.verdicts import (
     EXPLAINED,
     IN_PART,
@@ -158,7 +158,7 @@ def because_of_the_game(
         by_place = [at(group)[1].difference.mean for group in single]
         parts = [
             f"in the mean over {len(places)} configurations {parts[0]}; by configuration, from "
-            f"{min(by_place):+.1f} to {max(by_place):+.1f} is left"
+            f"{shown(min(by_place), '+.1f')} to {shown(max(by_place), '+.1f')} is left"
         ]
     return Finding(together(verdicts), "; ".join(parts))
 

@@ -8,9 +8,9 @@ import numpy as np
 import pandas as pd
 import scipy.stats
 
+from experiments.doors.pulling import strategy_of_part, strategy_of_policy
 from ipo.stats import mean_interval
-from ipo.worlds.pulling import strategy_of_part, strategy_of_policy
-from rules.cells import Cells, NoData, label
+from rules.cells import Cells, NoData, label, shown, with_interval
 from rules.verdicts import (
     UNDECIDED,
     Finding,
@@ -105,7 +105,7 @@ def hooks_are_robust(
     found = scipy.stats.spearmanr(part, success)
     evidence = (
         f"rank correlation over {len(part)} policies between the part of the hook's inside and "
-        f"success: {found.statistic:+.2f}, p = {found.pvalue:.3f}"
+        f"success: {shown(found.statistic, '+.2f')}, p = {found.pvalue:.3f}"
     )
     clear = found.pvalue < 0.05  # and not NaN, as where all policies are alike
     return Finding(holds(found.statistic > 0) if clear else UNDECIDED, evidence)
@@ -136,7 +136,7 @@ def matched_on_doors(doors: pd.DataFrame, unit: list[str]) -> Finding:
     low, high = effect + np.array([-1, 1]) * scipy.stats.t.ppf(0.975, num - 1) * error
     evidence = (
         f"at {both['door'].nunique()} doors that are opened in both ways, policies that hook open "
-        f"more by {effect:+.3f}, 95 % interval [{low:+.3f}, {high:+.3f}], over {num} "
+        f"more by {with_interval(effect, low, high)}, over {num} "
         f"{'seeds' if unit == ['run'] else 'trainings'}"
     )
     return Finding(verdict(low, high), evidence)

@@ -131,8 +131,8 @@ def largely_similar(
     evidence = (
         f"within {margin:.0%} in {verdicts.count(REPRODUCED)} of {len(verdicts)} configurations, "
         f"beyond in {verdicts.count(CONTRADICTED)}; {label(method)} differs by "
-        f"{min(relative):+.1%} to {max(relative):+.1%}, beyond chance in {apart} "
-        f"({corrected} by Holm's method)"
+        f"{shown(min(relative), '+.1%')} to {shown(max(relative), '+.1%')}, beyond chance in "
+        f"{apart} ({corrected} by Holm's method)"
     )
     return Finding(together(verdicts), evidence)
 

@@ -10,6 +10,7 @@ import pandas as pd
 import scipy.stats
 
 from ipo.stats import Difference, paired_difference, power
+from rules.cells import shown, with_interval
 
 REPRODUCED = "reproduced"
 IN_PART = "reproduced in part"
@@ -103,15 +104,15 @@ class Compared:
         """The difference with its interval, the paper's effect, and the power to find that one."""
         mean, low, high, p = self.difference
         digits = 1 if self.spread > 1 else 3
-        interval = f"[{low:+.{digits}f}, {high:+.{digits}f}]"
         chance = "p < 0.001" if p < 0.001 else f"p = {p:.3f}"
-        found = f"{mean:+.{digits}f}, 95 % interval {interval}, {chance}"
+        found = f"{with_interval(mean, low, high, digits)}, {chance}"
         if self.effect is None or not self.spread:
             return found
-        power_there = power(self.effect, self.spread, self.num_runs)
+        theirs = shown(self.effect, f"+.{digits}f")
+        there = power(self.effect, self.spread, self.num_runs)
         return (
-            f"{found} (the paper's difference is {self.effect:+.{digits}f}; the power to tell that "
-            f"from zero is {power_there:.0%})"
+            f"{found} (the paper's difference is {theirs}; the power to tell that from zero is "
+            f"{there:.0%})"
         )
 
 

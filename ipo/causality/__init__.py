@@ -1,8 +1,7 @@
 """The background: where invariance comes from, and what the game does in principle.
 
-scm              structural causal models: domains are interventions
-predictors       ERM, IRMv1, V-REx and IRM-Games for linear predictors
-icp              invariant causal prediction
-small_games      the game between players with two weights, and its equilibria
-scalar_control   a control problem with two weights
+scm           structural causal models: domains are interventions
+predictors    ERM, IRMv1, V-REx and IRM-Games for linear predictors
+icp           invariant causal prediction
+small_games   the game between players with two weights, and its equilibria
 """

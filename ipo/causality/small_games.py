@@ -2,12 +2,6 @@
 
 Everything that the book says about what the game does in principle is checked here: a policy is
 ``w [R, P]``, R problems with P weights each, and a domain is a cost ``J_d(w) [R]``.
-
-The domains of the book's example are linear regressions with a causal feature and a spurious one,
-
-    y = c x_1 + e,        x_1, e ~ N(0, 1) independent,        J_d(w) = E (y - w_1 x_1 - w_2 x_2)^2
-
-``x_2`` is related to y differently in every domain, so ``w = (c, 0)`` is the invariant predictor.
 """
 
 from __future__ import annotations
@@ -19,7 +13,6 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-from ipo.causality.predictors import Regression
 from ipo.checks import Natural, Positive, check_checkpoints, checked, one_of
 from ipo.game import Cost, LinearPlayers, Order, average, moves, nash_gap
 from ipo.optimizers import make_optimizer
@@ -29,14 +22,6 @@ GAME_METHODS = ("pooled", "ipo", "ensemble", "separate")
 Costs = Annotated[Sequence[Cost], "E"]  # of the domains
 Players = Annotated[Tensor, "R E P"]
 Start = Annotated[Tensor, "R P"] | Annotated[Tensor, "R players P"]
-
-
-def _at_least_two_domains(name: str, spurious: Tensor) -> None:
-    if spurious.shape[1] < 2:
-        raise ValueError(f"{name}: has shape {tuple(spurious.shape)}, must have 2 or more domains")
-
-
-Spurious = Annotated[Tensor, "R E", _at_least_two_domains]
 
 
 @checked
@@ -187,40 +172,6 @@ def vote(optima: Annotated[Tensor, "... E P"], bound: Positive) -> Tensor:
     phantoms = bound * (1 - 2 * torch.arange(num + 1, dtype=optima.dtype) / num)
     phantoms = phantoms.unsqueeze(-1).expand(*optima.shape[:-2], -1, optima.shape[-1])
     return torch.cat([optima, phantoms], dim=-2).median(dim=-2).values
-
-
-@checked
-def correlated_noise(spurious: Spurious, causal: float = 1.0) -> Regression:
-    """``x_2 = rho_d e + sqrt(1 - rho_d^2) n``: related to the noise of y, uncorrelated with x_1.
-
-    Features have variance 1, so costs are separable and a domain's own optimum is
-    ``(c, rho_d)``. ``spurious [R, E]`` holds the rho_d.
-
-    Raises:
-        ValueError: fewer than two domains, a coefficient that is NaN or outside [-1, 1].
-    """
-    if bool((spurious.abs() > 1).any()):
-        raise ValueError(f"spurious: holds {spurious.abs().max():.3g}, must be within [-1, 1]")
-    gram = torch.eye(2, dtype=spurious.dtype).expand(*spurious.shape, 2, 2)
-    moment = torch.stack([torch.full_like(spurious, causal), spurious], dim=-1)
-    return Regression(gram, moment, torch.full_like(spurious, causal**2 + 1))
-
-
-@checked
-def effect_of_target(spurious: Spurious, causal: float = 1.0) -> Regression:
-    """``x_2 = beta_d y + n``: an effect of y, and so correlated with x_1, too.
-
-    ``spurious [R, E]`` holds the beta_d. Costs are not separable.
-
-    Raises:
-        ValueError: fewer than two domains, a coefficient that is not finite.
-    """
-    power = causal**2 + 1
-    ones = torch.ones_like(spurious)
-    rows = [ones, causal * spurious, causal * spurious, power * spurious**2 + 1]
-    gram = torch.stack(rows, dim=-1).unflatten(-1, (2, 2))
-    moment = torch.stack([causal * ones, power * spurious], dim=-1)
-    return Regression(gram, moment, power * ones)
 
 
 def _check_start(costs: Sequence[Cost], start: Tensor, settings: GameSettings) -> None:

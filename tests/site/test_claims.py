@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import re
 import shutil
 from pathlib import Path
 
@@ -333,6 +334,14 @@ def test_the_page_of_claims_has_every_claim(data, tmp_path):
         assert f"*Decided by* `{claim['rule']}`" in page
         for choice in claim.get("variants", {}):
             assert f"| {choice} | {{bdg-" in page
+
+
+def test_negative_numbers_have_a_minus_sign(data):
+    book = claims.read_claims(data)
+    found = claims.decide_all(book, claims.read_results(book, data), data).values()
+    text = " ".join(own.evidence for one in found for own in (one, *one.variants.values()))
+    assert "−" in text
+    assert not re.search(r"(?<!\w)-\d", text)
 
 
 @pytest.mark.parametrize("claim", claims.read_claims()["claims"], ids=lambda claim: claim["id"])

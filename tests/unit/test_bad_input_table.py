@@ -1,4 +1,4 @@
-"""Bad input to every public function of ``ipo`` and of the book's tables: an error that names it.
+"""Bad input to every public function of ``ipo``, and of what is like it: an error that names it.
 
 A row is something callable, good arguments, and for each parameter the kind of value that it must
 refuse. What is public is found by walking the package: without a row, or a reason in ``TRUSTING``
@@ -31,18 +31,19 @@ import ipo
 from experiments import keys, tables
 from experiments import lqr as lqr_experiments
 from experiments.chapter import Chapter
-from experiments.doors import success, training
+from experiments.doors import hooking, pulling, success, training
 from experiments.experiment import Experiment
+from experiments.games import regressions, scalar_control
 from experiments.pictures import DoorPicture
 from experiments.store import Store
 from experiments.witness import side_by_side
 from ipo import game, lqr, lqr_learners, optimizers, own_domains, ppo, rollouts, stats
-from ipo.causality import icp, predictors, scalar_control, scm, small_games
+from ipo.causality import icp, predictors, scm, small_games
 from ipo.distributions import Categorical
 from ipo.networks import DenseNetwork, GridNetwork, OnTable, copied
 from ipo.own_domains import copies, networks
 from ipo.own_domains import policy as policies
-from ipo.worlds import colored_keys, door, hooking, many_doors, pulling, tabular
+from ipo.worlds import colored_keys, door, many_doors, tabular
 
 NAN, INF = math.nan, math.inf
 
@@ -472,9 +473,9 @@ def rows_of_causality() -> Iterator[Row]:
     few = lambda good: array("runs longer single")(good) + bad("sample size", good[:, :1])  # noqa: E731
     outside = lambda good: few(good) + bad("probability", 3 * good)  # noqa: E731
     good = {"spurious": spurious}
-    yield row(small_games.correlated_noise, good, spurious=outside, causal=NUMBER)
-    yield row(small_games.effect_of_target, good, spurious=few, causal=NUMBER)
-    costs = small_games.correlated_noise(spurious).costs
+    yield row(regressions.correlated_noise, good, spurious=outside, causal=NUMBER)
+    yield row(regressions.effect_of_target, good, spurious=few, causal=NUMBER)
+    costs = regressions.correlated_noise(spurious).costs
     policy, players = torch.zeros(2, 2), torch.zeros(2, 2, 2)
     of_domains = LIST + bad("kind of object", [3, 3])
     yield row(small_games.GameSettings, {"method": "ipo"}, num_rounds=NATURAL)
@@ -734,15 +735,15 @@ TRUSTING = {
     r"ipo\.causality\.icp\.ICPResult": RECORD,
     r"ipo\.causality\.predictors\.\w+\.(risks|gradients|errors)": LOOP,
     r"ipo\.causality\.predictors\.irm_(objective|penalties)": LOOP,
-    r"ipo\.causality\.scalar_control\.training_cost": LOOP,
     r"ipo\.causality\.scm\.(Linear|Mechanism)\.__call__": "called by SCM.sample with what it drew",
     r"ipo\.worlds\.door\.(hook_rotation|fingertip_position|target_position|reward|observe)": LOOP,
     r"ipo\.worlds\.door\.(lever|draw_start|shift_handle)": LOOP,
     r"ipo\.worlds\.door\.check_.*": "is a check itself; DoorEnv.step shows it",
-    r"ipo\.worlds\.hooking\.Hooking\.__call__": LOOP,
-    r"ipo\.worlds\.pulling\.(pulling_forces|is_inside)": LOOP,
     r"ipo\.worlds\.tabular\.(NotTabularError|TabularEnvironments)": "made by TabularDomains",
     r"ipo\.worlds\.tabular\.TabularEnvironments\.step": LOOP,
+    r"experiments\.games\.scalar_control\.training_cost": LOOP,
+    r"experiments\.doors\.hooking\.Hooking\.__call__": LOOP,
+    r"experiments\.doors\.pulling\.(pulling_forces|is_inside)": LOOP,
 }
 
 
@@ -750,7 +751,9 @@ def public() -> dict[str, Callable]:
     """Every function, class and method with a parameter that a caller chooses."""
     found: dict[str, Callable] = {}
     modules = [module.name for module in pkgutil.walk_packages(ipo.__path__, "ipo.")]
-    for module in (*modules, tables.__name__):
+    games = regressions, scalar_control
+    modules += [module.__name__ for module in (tables, *games, hooking, pulling)]
+    for module in modules:
         for name, thing in vars(importlib.import_module(module)).items():
             if getattr(thing, "__module__", None) != module or name.startswith("_"):
                 continue

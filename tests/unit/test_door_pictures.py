@@ -11,9 +11,9 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import ipo  # noqa: F401  (registers the environments)
+from experiments.doors.hooking import Hooking
 from experiments.pictures import DoorPicture, RenderError, door_scene
 from ipo.worlds.door import DoorEnv, DoorParams, build_door
-from ipo.worlds.hooking import Hooking
 
 SHIFT = np.array([0.05, -0.05])
 

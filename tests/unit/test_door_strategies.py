@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 
 from experiments.doors import success as door_experiments
-from experiments.doors.success import Cell, ScriptedCell, watch
-from experiments.doors.training import CELLS, NETWORK, last_info, made_for, policy_path
-from experiments.policies import save_policy
-from ipo.worlds.door import DoorEnv, DoorParams
-from ipo.worlds.hooking import Hooking
-from ipo.worlds.pulling import (
+from experiments.doors.hooking import Hooking
+from experiments.doors.pulling import (
     is_inside,
     strategy,
     strategy_of_part,
     strategy_of_policy,
 )
+from experiments.doors.success import Cell, ScriptedCell, watch
+from experiments.doors.training import CELLS, NETWORK, last_info, made_for, policy_path
+from experiments.policies import save_policy
+from ipo.worlds.door import DoorEnv, DoorParams
 
 
 def scripted(side: str, seed: int) -> str:

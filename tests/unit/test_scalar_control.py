@@ -6,7 +6,7 @@ import torch
 from small import assert_close, assert_near
 
 from experiments.games.scalar import START, Cell, gains_of, problems, run_cell, standard
-from ipo.causality.scalar_control import (
+from experiments.games.scalar_control import (
     EDGE,
     costs,
     invariant_gains,

@@ -17,6 +17,8 @@ import torch
 
 from experiments.doors import players as door_players
 from experiments.doors import training as door_training
+from experiments.doors.hooking import Hooking
+from experiments.doors.pulling import strategy
 from experiments.doors.training import (
     CHOICES,
     EVALUATION_SEED,
@@ -30,8 +32,6 @@ from ipo.checks import Count, Natural, NonNegative, check_choice, check_count, c
 from ipo.distributions import Gaussian
 from ipo.networks import Weights
 from ipo.worlds.door import DoorEnv, DoorParams
-from ipo.worlds.hooking import Hooking
-from ipo.worlds.pulling import strategy
 
 TEST_FRICTIONS = (1.1, 1.2, 1.3, 1.4, 1.5)  # of the paper's Table 4
 NUM_DOORS = 200
@@ -173,7 +173,7 @@ def watch(
     """How doors are opened: rows like those of :func:`evaluate`, one door after the other.
 
     Metrics: ``success``; and for doors that were opened ``inside_part``, the part of the pulling
-    impulse that the inside of the hook had (:func:`ipo.worlds.pulling.strategy`), and
+    impulse that the inside of the hook had (:func:`experiments.doors.pulling.strategy`), and
     ``opened_at``, the number of steps that it took.
     """
     rows = []

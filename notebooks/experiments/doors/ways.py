@@ -16,11 +16,11 @@ import scipy.stats
 import torch
 
 from experiments.doors.arms import NAMES, PUBLISHED, of_arm, percent, percent_with_interval, rate
+from experiments.doors.pulling import strategy_of_part, strategy_of_policy
 from experiments.doors.success import Cell, load_players
 from experiments.doors.training import TRAIN_FRICTIONS
 from experiments.tables import mean_and_std
 from ipo.networks import Weights
-from ipo.worlds.pulling import strategy_of_part, strategy_of_policy
 
 STRATEGIES = ("hook", "mixed", "outside")
 TRAITS = {

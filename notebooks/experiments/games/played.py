@@ -16,14 +16,13 @@ import torch
 from torch import Tensor
 
 from experiments.experiment import Experiment
+from experiments.games import scalar_control
+from experiments.games.regressions import correlated_noise, effect_of_target
 from experiments.rows import tidy
 from experiments.store import select
-from ipo.causality import scalar_control
 from ipo.causality.predictors import PredictorSettings, Regression, irm_objective
 from ipo.causality.small_games import (
     GameSettings,
-    correlated_noise,
-    effect_of_target,
     gap,
     last,
     play,

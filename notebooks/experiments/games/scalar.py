@@ -15,10 +15,10 @@ from experiments.experiment import Experiment
 from experiments.figures import OUTCOMES
 from experiments.games import played as games_played
 from experiments.games import players
+from experiments.games.scalar_control import costs, stationary_cost, unseen_cost
 from experiments.origin import ROOT
 from experiments.rows import tidy
 from experiments.store import Store, select
-from ipo.causality.scalar_control import costs, stationary_cost, unseen_cost
 from ipo.causality.small_games import GameSettings, last, residual
 from ipo.checks import check_choice
 from ipo.game import average
