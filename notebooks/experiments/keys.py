@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -44,6 +45,7 @@ ENCODINGS = ("integer", "one_hot", "none")
 COLOR_CHANNEL = 1
 NUM_COPIES, NUM_EPISODES = 50, 100  # of the published evaluation
 NUM_SAVED = 10  # runs of a cell whose weights are kept
+WITNESSED = {"weight_decay": 0.1, "dropout": 0.1, "variance_penalty": 10, "scale_penalty": 10}
 
 
 def published(method: str, **changes: Any) -> PPOSettings:
@@ -125,6 +127,13 @@ TURNS = {
     "in_turn_lr1e-3": "one network, one domain at a time, PPO's learning rate",
 }
 ARMS = MAIN | TURNS
+IN_FULL = {
+    "ipo_inner2": "IPO, K = 2",
+    "ipo_inner4": "IPO, K = 4",
+    "ipo_phi": "IPO, variable Φ",
+    "ipo_phi_short": "IPO, variable Φ, the paper's frames",
+    "ipo_phi_inner4_short": "IPO, variable Φ, K = 4, the paper's frames",
+}
 LARGER = {
     "ppo": "PPO, 122,880 frames",
     "ipo": "IPO, 122,880 frames",
@@ -162,6 +171,28 @@ def turn_arms(num_updates: int, train_colors: Sequence[str] = TRAINED) -> list[C
     return [
         of("in_turn", "in_turn", learning_rate=5e-4),
         of("in_turn_lr1e-3", "in_turn", learning_rate=1e-3),
+    ]
+
+
+def full_arms(num_updates: int, train_colors: Sequence[str] = TRAINED) -> list[Cell]:
+    """Algorithm 1 with K inner rounds, and with a variable Phi, which collects as all players do.
+
+    A round then has 1 + K times the frames of IPO as published; ``short`` arms have fewer rounds,
+    so that they see as many frames in all.
+    """
+    of = partial(arm, method="ipo", train_colors=tuple(train_colors))
+    phi = {"variable_phi": True}
+    return [
+        of("ipo_phi_short", num_updates=math.ceil(num_updates / 2), **phi),
+        of("ipo_inner2", num_updates=num_updates, num_inner_rounds=2),
+        of("ipo_phi", num_updates=num_updates, **phi),
+        of(
+            "ipo_phi_inner4_short",
+            num_updates=math.ceil(num_updates / 5),
+            num_inner_rounds=4,
+            **phi,
+        ),
+        of("ipo_inner4", num_updates=num_updates, num_inner_rounds=4),
     ]
 
 
@@ -238,6 +269,11 @@ def run_cell(
         first = [{name: w[:NUM_SAVED] for name, w in player.items()} for player in players]
         save_policy(policy_path(policies, cell), first, made_for)
     return tidy(cell, seeds, evaluate(task, players, seeds))
+
+
+def run_rows(cell: Cell, seeds: list[int], tables: str | Path) -> pd.DataFrame:
+    """The same, of which no weights are kept."""
+    return run_cell(cell, seeds, tables)
 
 
 def policy_path(policies: str | Path, cell: Cell) -> Path:
@@ -416,6 +452,8 @@ def description(task: TabularTask) -> dict[str, float]:
 def short(cell: Cell) -> Cell | None:
     """Two updates. Larger grids take minutes to tabulate; other colours are of no other kind.
 
+    Nor are inner rounds without a variable Phi, and other weights of a regulariser than one.
+
     Normalised advantages are large while returns are nearly zero: there one update is enough for
     rounding to become visible, and two make another policy of it.
     """
@@ -423,17 +461,28 @@ def short(cell: Cell) -> Cell | None:
         return None
     if cell.settings.method == "ensemble" and cell.color_encoding != "integer":
         return None
+    if cell.settings.num_inner_rounds > 1 and not cell.settings.variable_phi:
+        return None
+    if any(getattr(cell.settings, name) not in (0, one) for name, one in WITNESSED.items()):
+        return None
     num_updates = 2 if cell.settings.normalize_advantages == "none" else 1
     return replace(cell, settings=replace(cell.settings, num_updates=num_updates))
 
 
-EXPERIMENTS = {
-    name: Experiment(run_cell, Cell, short, runs_at_once=25)
-    for name in ("main", "turns", "variants", "larger")
-} | {
-    "curves": Experiment(run_curve, Cell, short, runs_at_once=25),
-    "grids": Experiment(run_grid, Grid, lambda grid: grid if grid.size == 5 else None, (0,)),
-}
+EXPERIMENTS = (
+    {
+        name: Experiment(run_cell, Cell, short, runs_at_once=25)
+        for name in ("main", "turns", "variants", "larger")
+    }
+    | {
+        name: Experiment(run_rows, Cell, short, runs_at_once=25)
+        for name in ("in_full", "regularized")
+    }
+    | {
+        "curves": Experiment(run_curve, Cell, short, runs_at_once=25),
+        "grids": Experiment(run_grid, Grid, lambda grid: grid if grid.size == 5 else None, (0,)),
+    }
+)
 
 
 # ------------------------------------------------------------------------- read off the rows

@@ -348,6 +348,7 @@ EXPERIMENTS = {
         "optimizers",
         "controls",
         "turns",
+        "regularized",
     )
 } | {
     "curves": Experiment(run_curve, Cell, short),
