@@ -125,13 +125,14 @@ class PPOSettings:
         return moves("pooled" if self.method == "ppo" else self.method, num_domains)
 
     def copies(self, num_domains: int) -> list[list[int]]:
-        """How many copies each move has of each of its domains."""
+        """How many copies each move has of each of its domains; last, Phi's if it is variable."""
         owned = [move.domains for move in self.moves(num_domains)]
         num_owners = len(owned) if len(owned[0]) > 1 else 1
-        of_domain = self.copies_of_domains(num_domains, num_owners)
-        return [[of_domain[domain] // num_owners for domain in domains] for domains in owned]
+        of_domain = self._copies_of_domains(num_domains, num_owners)
+        copies = [[of_domain[domain] // num_owners for domain in domains] for domains in owned]
+        return [*copies, of_domain] if self.variable_phi else copies
 
-    def copies_of_domains(self, num_domains: int, num_owners: int = 1) -> list[int]:
+    def _copies_of_domains(self, num_domains: int, num_owners: int) -> list[int]:
         """How many there are of each, to be shared evenly by so many players."""
         if not isinstance(self.num_envs, tuple):
             if self.num_envs % (num_domains * num_owners):
@@ -210,7 +211,6 @@ class Training:
         owned = [move.domains for move in self.moves]
         if settings.variable_phi:
             owned.append(list(range(num_domains)))
-            copies.append(settings.copies_of_domains(num_domains))
         for own in copies:
             settings.size_of_minibatches(settings.num_steps * sum(own))
         _check_needs(network, owned, settings)

@@ -158,7 +158,9 @@ def keys_values(rows: pd.DataFrame, train_colors: Sequence[str] = keys.TRAINED) 
     """Exact returns by arm and run: the mean of ``training`` colours, and the ``new`` one's."""
     exact = rows[rows["metric"] == "return_exact"]
     wide = exact.pivot_table("value", ["method", "run"], "domain")
-    return pd.DataFrame({"training": wide[list(train_colors)].mean(1), "new": wide[keys.TESTED]})
+    return pd.DataFrame(
+        {"training": wide[list(train_colors)].mean(axis=1), "new": wide[keys.TESTED]}
+    )
 
 
 def lqr_values(rows: pd.DataFrame) -> pd.DataFrame:
