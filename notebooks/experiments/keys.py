@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -127,13 +126,6 @@ TURNS = {
     "in_turn_lr1e-3": "one network, one domain at a time, PPO's learning rate",
 }
 ARMS = MAIN | TURNS
-IN_FULL = {
-    "ipo_inner2": "IPO, K = 2",
-    "ipo_inner4": "IPO, K = 4",
-    "ipo_phi": "IPO, variable Φ",
-    "ipo_phi_short": "IPO, variable Φ, the paper's frames",
-    "ipo_phi_inner4_short": "IPO, variable Φ, K = 4, the paper's frames",
-}
 LARGER = {
     "ppo": "PPO, 122,880 frames",
     "ipo": "IPO, 122,880 frames",
@@ -171,28 +163,6 @@ def turn_arms(num_updates: int, train_colors: Sequence[str] = TRAINED) -> list[C
     return [
         of("in_turn", "in_turn", learning_rate=5e-4),
         of("in_turn_lr1e-3", "in_turn", learning_rate=1e-3),
-    ]
-
-
-def full_arms(num_updates: int, train_colors: Sequence[str] = TRAINED) -> list[Cell]:
-    """Algorithm 1 with K inner rounds, and with a variable Phi, which collects as all players do.
-
-    A round then has 1 + K times the frames of IPO as published; ``short`` arms have fewer rounds,
-    so that they see as many frames in all.
-    """
-    of = partial(arm, method="ipo", train_colors=tuple(train_colors))
-    phi = {"variable_phi": True}
-    return [
-        of("ipo_phi_short", num_updates=math.ceil(num_updates / 2), **phi),
-        of("ipo_inner2", num_updates=num_updates, num_inner_rounds=2),
-        of("ipo_phi", num_updates=num_updates, **phi),
-        of(
-            "ipo_phi_inner4_short",
-            num_updates=math.ceil(num_updates / 5),
-            num_inner_rounds=4,
-            **phi,
-        ),
-        of("ipo_inner4", num_updates=num_updates, num_inner_rounds=4),
     ]
 
 
