@@ -30,23 +30,18 @@ def variance_factors(returns: Tensor, sizes: Sequence[int], penalty: float) -> T
 
 
 def scale_factors(
-    log_probabilities: Tensor,
-    entropies: Tensor,
-    advantages: Tensor,
-    sizes: Sequence[int],
-    penalty: float,
+    slopes: Tensor, advantages: Tensor, sizes: Sequence[int], penalty: float
 ) -> Tensor:
-    """``2 penalty g_d`` of each frame's domain, ``[R, F]``; all arguments but the last are, too.
+    """``2 penalty g_d`` of each frame's domain, ``[R, F]`` as slopes and advantages are.
 
     g_d is the derivative of a domain's return by a factor w on the scores of all actions, at w = 1.
     Where no common factor could make any domain better, all g_d are zero::
 
         penalty * mean_d g_d^2,      g_d = E_d[ A (log pi(a | o) + H(pi( . | o))) ]
 
-    The bracket is ``d log pi / d w = z_a - sum_i pi_i z_i`` for scores z.
+    The bracket is the slope of ``log pi``, ``z_a - sum_i pi_i z_i`` for scores z.
     """
-    slopes = _means_of_domains(advantages * (log_probabilities + entropies), sizes)
-    return _for_frames(2 * penalty * slopes, sizes)
+    return _for_frames(2 * penalty * _means_of_domains(advantages * slopes, sizes), sizes)
 
 
 def _means_of_domains(x: Tensor, sizes: Sequence[int]) -> Tensor:

@@ -287,17 +287,17 @@ class Training:
 
     def _learn(self, move: int, part: int) -> None:
         """Collect in the environments of a move, and improve a part."""
-        average, settings = self.network.frozen(self.players), self.settings
-        rollout = self.collectors[move].collect(average, self.network.distribution, self.draws)
+        average, distribution = self.network.frozen(self.players), self.network.distribution
+        rollout = self.collectors[move].collect(average, distribution, self.draws)
         self.num_frames += rollout.values[0].numel()
         frames, sizes, factors = rollout.frames(), self.sizes[move], None
-        if settings.variance_penalty:
-            by_domain = variance_factors(frames.returns, sizes, settings.variance_penalty)
+        if penalty := self.settings.variance_penalty:
+            by_domain = variance_factors(frames.returns, sizes, penalty)
             frames = frames._replace(advantages=by_domain * frames.advantages)
-        if settings.scale_penalty:
-            entropies = self.network.distribution.entropy(average(frames.observations)[0])
-            chosen = frames.log_probabilities, entropies, frames.advantages
-            factors = scale_factors(*chosen, sizes, settings.scale_penalty)
+        if penalty := self.settings.scale_penalty:
+            entropies = distribution.entropy(average(frames.observations)[0])
+            slopes = frames.log_probabilities + entropies
+            factors = scale_factors(slopes, frames.advantages, sizes, penalty)
         self.improve(part, frames, factors)
 
     def improve(self, d: int, frames: Rollout, factors: Tensor | None = None) -> None:
@@ -307,7 +307,7 @@ class Training:
         ``factors [R, F]`` are those of a penalty on the scale of scores.
         """
         settings, share = self.settings, 1 / len(self.players)
-        others = self._others(d, frames.observations)
+        distribution, others = self.network.distribution, self._others(d, frames.observations)
         columns = others if factors is None else [*others, factors]
         if settings.normalize_advantages == "rollout":
             frames = frames._replace(advantages=standardize(frames.advantages))
@@ -318,14 +318,8 @@ class Training:
                 parameters, values = share * parameters, share * values
                 if others:
                     parameters, values = more[0] + parameters, more[1] + values
-                slopes = loss_gradient(
-                    self.network.distribution,
-                    parameters,
-                    values,
-                    batch,
-                    settings,
-                    more[-1] if factors is not None else None,
-                )
+                outputs, rest = (parameters, values), more[len(others) :]
+                slopes = loss_gradient(distribution, *outputs, batch, settings, *rest)
                 self._descend(d, pull_back(*(share * slope for slope in slopes)))
 
     def _vjp(self, d: int, observations: Tensor) -> tuple[Outputs, PullBack]:
