@@ -40,9 +40,12 @@ class Distribution(Protocol):
 
     @staticmethod
     def gradient(
-        parameters: Tensor, actions: Tensor, weights: Tensor, entropy_weight: float
+        parameters: Tensor, actions: Tensor, weights: Tensor, entropy_weight: float | Tensor
     ) -> Tensor:
-        """Of ``weights [...] log pi(a | o) + entropy_weight H`` in the parameters."""
+        """Of ``weights [...] log pi(a | o) + entropy_weight H`` in the parameters.
+
+        The weight of the entropy is a number, or ``[..., 1]``.
+        """
 
 
 class Categorical:
@@ -69,7 +72,7 @@ class Categorical:
 
     @staticmethod
     def gradient(
-        parameters: Tensor, actions: Tensor, weights: Tensor, entropy_weight: float
+        parameters: Tensor, actions: Tensor, weights: Tensor, entropy_weight: float | Tensor
     ) -> Tensor:
         """d log pi(a) / d z_i = 1(i = a) - pi(i),   d H / d z_i = - pi(i) (log pi(i) + H)."""
         log_probabilities = _log_softmax(parameters)
@@ -113,7 +116,7 @@ class Gaussian:
 
     @staticmethod
     def gradient(
-        parameters: Tensor, actions: Tensor, weights: Tensor, entropy_weight: float
+        parameters: Tensor, actions: Tensor, weights: Tensor, entropy_weight: float | Tensor
     ) -> Tensor:
         """With z = (a - m) / s: dlog pi/dm = z / s,  dlog pi/ds = (z^2 - 1) / s,  dH/ds = 1 / s."""
         mean, deviation = parameters.chunk(2, -1)

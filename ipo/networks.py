@@ -39,10 +39,12 @@ class Network(ABC):
     Attributes:
         distribution: what the outputs of the actor are parameters of.
         shapes: ``{layer: (inputs, units)}``.
+        phi: the layers that see observations, which players share where Phi is variable.
     """
 
     distribution: type[Distribution]
     shapes: dict[str, tuple[int, int]]
+    phi: Sequence[str] = ()
 
     @property
     def weight_shapes(self) -> dict[str, tuple[int, ...]]:
@@ -119,6 +121,7 @@ class DenseNetwork(Network):
             sizes = [num_observations, *hidden, num_outputs]
             self.layers[part] = [f"{part}{i + 1}" for i in range(len(sizes) - 1)]
             self.shapes |= zip(self.layers[part], itertools.pairwise(sizes), strict=True)
+        self.phi = [layers[0] for layers in self.layers.values()] if hidden else []
 
     @property
     def weight_shapes(self) -> dict[str, tuple[int, ...]]:
@@ -229,6 +232,7 @@ class GridNetwork(Network):
     """
 
     distribution = Categorical
+    phi = ("conv1", "conv2", "conv3")
 
     @checked
     def __init__(self, num_channels: Count = 3, num_actions: Count = 7) -> None:
@@ -290,6 +294,7 @@ class OnTable:
     def __init__(self, network: GridNetwork, table: Annotated[Tensor, "K 7 7 C"]) -> None:
         self.network, self.table = network, table
         self.distribution, self.start = network.distribution, network.start
+        self.phi, self.shapes = network.phi, network.shapes
 
         def distinct(parts: Tensor) -> tuple[Tensor, Tensor]:
             return parts.flatten(0, -2).unique(dim=0, return_inverse=True)
@@ -368,6 +373,42 @@ def vjp(
         return list(torch.autograd.grad(outputs, list(leaves.values()), slopes))
 
     return (outputs[0].detach(), outputs[1].detach()), pull_back
+
+
+def dropout_factors(
+    network: Network | OnTable, weights: Weights, probability: float, generators: Generators
+) -> Weights:
+    """Of dropout above Phi: ``{name: [R, inputs, 1]}`` for the matrix of each layer.
+
+    An input is left out, 0, with the probability, or scaled by 1 / (1 - probability). What is left
+    out is left out for all frames of a minibatch, and drawn run by run.
+    """
+    factors = {}
+    for layer, (num_inputs, _) in network.shapes.items():
+        if layer not in network.phi:
+            uniform = np.stack([generator.random(num_inputs) for generator in generators])
+            kept = torch.from_numpy((uniform >= probability) / (1 - probability))
+            name = f"{layer}.weight"
+            factors[name] = kept.to(weights[name]).unsqueeze(-1)
+    return factors
+
+
+def vjp_with_dropout(
+    network: Network | OnTable, weights: Weights, observations: Tensor, factors: Weights
+) -> tuple[Outputs, PullBack]:
+    """:meth:`Network.vjp` where some matrices are multiplied by factors."""
+
+    def multiplied(name: str, x: Tensor) -> Tensor:
+        return x * factors[name] if name in factors else x
+
+    thinned = {name: multiplied(name, w) for name, w in weights.items()}
+    outputs, pull_back = network.vjp(thinned, observations)
+
+    def pull_back_to_all(of_parameters: Tensor, of_values: Tensor) -> list[Tensor]:
+        slopes = pull_back(of_parameters, of_values)
+        return [multiplied(name, x) for name, x in zip(weights, slopes, strict=True)]
+
+    return outputs, pull_back_to_all
 
 
 @checked

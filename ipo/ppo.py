@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial, reduce
 from typing import Annotated, Any
 
 import numpy as np
@@ -24,12 +25,24 @@ from ipo.checks import (
     Probability,
     Seeds,
     check_count,
+    check_number,
     checked,
     one_of,
 )
-from ipo.distributions import Distribution, Generators
+from ipo.distributions import Categorical, Distribution, Generators
 from ipo.game import Move, moves, play_round
-from ipo.networks import Network, OnTable, Weights, chosen_rows, in_one_row
+from ipo.networks import (
+    Network,
+    OnTable,
+    Outputs,
+    PullBack,
+    Weights,
+    chosen_rows,
+    dropout_factors,
+    in_one_row,
+    vjp_with_dropout,
+)
+from ipo.penalties import scale_factors, variance_factors
 from ipo.rollouts import Collector, Device, Environments, Rollout, TimeOuts
 
 METHODS = ("ppo", "ipo", "ensemble", "in_turn")
@@ -49,7 +62,10 @@ class PPOSettings:
             PPO's, trained on one domain at a time like IPO's.
         learning_rate: of Adam; the paper has 1e-3 for PPO and 5e-4 for IPO.
         adam_epsilon: keeps Adam's denominator from 0.
-        num_updates: rounds, in each of which every player collects and learns once.
+        num_updates: rounds, in each of which every player collects and learns K times.
+        num_inner_rounds: K of Algorithm 1; it is 1 in all runs of the paper.
+        variable_phi: whether players share the network's first part Phi, which moves first in each
+            round, on the return of all domains; all runs of the paper fix it to the identity.
         num_envs: copies of the environment, split evenly among domains; or how many of each
             domain. Players who own the same domain share its copies evenly.
         num_steps: T, of each rollout.
@@ -71,12 +87,18 @@ class PPOSettings:
             learns nothing from it (the published doors).
         skip_last_frames: whether every second epoch leaves out the last frame of each copy; the
             published keys do, by a side effect of code for recurrent networks.
+        weight_decay: decoupled (AdamW), per unit of learning rate, of all weights.
+        dropout: probability with which an input of a layer above the network's Phi is left out of
+            a gradient step; those that stay are scaled up. Rollouts are collected with all.
+        variance_penalty, scale_penalty: weights of :mod:`ipo.penalties`, after V-REx and IRMv1.
     """
 
     method: Annotated[str, one_of(METHODS)]
     learning_rate: Positive = 1e-3
     adam_epsilon: Positive = 1e-8
     num_updates: Count = 20
+    num_inner_rounds: Count = 1
+    variable_phi: bool = False
     num_envs: Count | Annotated[tuple[Count, ...], "domains"] = 48
     num_steps: Count = 128
     num_epochs: Count = 4
@@ -93,30 +115,38 @@ class PPOSettings:
     normalize_advantages: Annotated[str, one_of(NORMALIZATIONS)] = "none"
     time_outs: TimeOuts = "bootstrap"
     skip_last_frames: bool = False
+    weight_decay: NonNegative = 0.0
+    dropout: Annotated[float, partial(check_number, least=0, below=1)] = 0.0
+    variance_penalty: NonNegative = 0.0
+    scale_penalty: NonNegative = 0.0
 
     def moves(self, num_domains: int) -> list[Move]:
         """Of a round; ``ppo`` is what the game calls ``pooled``."""
         return moves("pooled" if self.method == "ppo" else self.method, num_domains)
 
     def copies(self, num_domains: int) -> list[list[int]]:
-        """How many copies each move has of each of its domains."""
+        """How many copies each move has of each of its domains; last, Phi's if it is variable."""
         owned = [move.domains for move in self.moves(num_domains)]
         num_owners = len(owned) if len(owned[0]) > 1 else 1
+        of_domain = self._copies_of_domains(num_domains, num_owners)
+        copies = [[of_domain[domain] // num_owners for domain in domains] for domains in owned]
+        return [*copies, of_domain] if self.variable_phi else copies
+
+    def _copies_of_domains(self, num_domains: int, num_owners: int) -> list[int]:
+        """How many there are of each, to be shared evenly by so many players."""
         if not isinstance(self.num_envs, tuple):
             if self.num_envs % (num_domains * num_owners):
                 raise ValueError(
                     f"num_envs = {self.num_envs}: must be a multiple of "
                     f"{num_domains * num_owners}, to be split evenly among players and domains"
                 )
-            of_domain = [self.num_envs // num_domains] * num_domains
-        else:
-            of_domain = list(self.num_envs)
-            if len(of_domain) != num_domains or any(n % num_owners for n in of_domain):
-                raise ValueError(
-                    f"num_envs = {self.num_envs}: must name a multiple of {num_owners} for each "
-                    f"of {num_domains} domains"
-                )
-        return [[of_domain[domain] // num_owners for domain in domains] for domains in owned]
+            return [self.num_envs // num_domains] * num_domains
+        if len(self.num_envs) != num_domains or any(n % num_owners for n in self.num_envs):
+            raise ValueError(
+                f"num_envs = {self.num_envs}: must name a multiple of {num_owners} for each "
+                f"of {num_domains} domains"
+            )
+        return list(self.num_envs)
 
     def size_of_minibatches(self, num_frames: int) -> int:
         """Of a rollout with ``num_frames``."""
@@ -153,15 +183,17 @@ class Training:
 
     Attributes:
         players: weights of every player; they change in place.
-        rows: the same memory as one ``[R, P]`` for each player, which the optimisers move.
+        parts: what moves at a time: each player's own weights; last Phi's, where it is variable,
+            which are in all players.
+        rows: the same memory as one ``[R, P]`` for each part, which the optimisers move.
         moves: of a round: who moves, on which domains.
-        collectors: the environments of every move.
+        collectors: the environments of every move, last Phi's.
         num_frames: seen so far, in each run.
 
     Raises:
         ValueError: ``num_envs`` that cannot be split evenly among players and domains, a
             minibatch larger than a player's rollout, seeds that are no different whole numbers,
-            a device that is not there.
+            a device that is not there, a network without what the settings need.
     """
 
     @checked
@@ -176,26 +208,54 @@ class Training:
     ) -> None:
         self.moves = settings.moves(num_domains)
         copies = settings.copies(num_domains)
+        owned = [move.domains for move in self.moves]
+        if settings.variable_phi:
+            owned.append(list(range(num_domains)))
         for own in copies:
             settings.size_of_minibatches(settings.num_steps * sum(own))
-        streams = [np.random.SeedSequence(seed).spawn(3) for seed in seeds]
-        self.draws, self.resets, self.orders = (
-            [np.random.default_rng(stream[i]) for stream in streams] for i in range(3)
+        _check_needs(network, owned, settings)
+        streams = [np.random.SeedSequence(seed).spawn(4) for seed in seeds]
+        self.draws, self.resets, self.orders, self.dropouts = (
+            [np.random.default_rng(stream[i]) for stream in streams] for i in range(4)
         )
         self.network, self.settings, self.num_frames = network, settings, 0
-        num_players = 1 + max(move.player for move in self.moves)
-        drawn = [network.start(self.draws) for _ in range(num_players)]
-        starts = [in_one_row({name: w.to(device) for name, w in own.items()}) for own in drawn]
-        self.rows, self.players = map(list, zip(*starts, strict=True))
+        self._start(device)
         self.optimizers = [
-            torch.optim.Adam([own], settings.learning_rate, eps=settings.adam_epsilon, fused=True)
+            torch.optim.AdamW(
+                [own],
+                settings.learning_rate,
+                eps=settings.adam_epsilon,
+                weight_decay=settings.weight_decay,
+                fused=True,
+            )
             for own in self.rows
         ]
         environments = [
-            make_environments(move.domains, own, self.resets)
-            for move, own in zip(self.moves, copies, strict=True)
+            make_environments(domains, own, self.resets)
+            for domains, own in zip(owned, copies, strict=True)
         ]
         self.collectors = [settings.collector(own, device) for own in environments]
+        self.sizes = [[settings.num_steps * number for number in own] for own in copies]
+
+    def _start(self, device: Device) -> None:
+        """Draw all players, as ever; what they share is that of the first."""
+        num_players = 1 + max(move.player for move in self.moves)
+        drawn = [self.network.start(self.draws) for _ in range(num_players)]
+        drawn = [{name: w.to(device) for name, w in own.items()} for own in drawn]
+        names = list(drawn[0])
+        shared = self.network.phi if self.settings.variable_phi else ()
+        phi = [name for name in names if name.split(".")[0] in shared]
+        parts = [{name: own[name] for name in names if name not in phi} for own in drawn]
+        self.movers = [[d] for d in range(num_players)]  # players of whom a part is a part
+        if phi:
+            parts.append({name: drawn[0][name] for name in phi})
+            self.movers.append(list(range(num_players)))
+        self.rows, self.parts = map(list, zip(*map(in_one_row, parts), strict=True))
+        common = self.parts[-1]
+        self.players = [
+            {name: (common if name in phi else own)[name] for name in names}
+            for own in self.parts[:num_players]
+        ]
 
     def reports(self) -> Iterator[tuple[int, list[Weights]]]:
         """Train to the end: ``(num_frames, players)`` now and after each update.
@@ -210,41 +270,88 @@ class Training:
     def update(self, only: int | None = None) -> None:
         """One round of Algorithm 1; or one of its moves, while all else stands still."""
         if only is None:
-            play_round(len(self.moves), self.respond, num_inner_rounds=1, move_phi=None)
+            settings = self.settings
+            move_phi = self.move_phi if settings.variable_phi else None
+            play_round(len(self.moves), self.respond, settings.num_inner_rounds, move_phi)
         else:
             check_count("only", only, 0, len(self.moves) - 1)
             self.respond(only)
 
     def respond(self, d: int) -> None:
         """Move d: its player collects with the average of all players, and learns."""
-        average = self.network.frozen(self.players)
-        rollout = self.collectors[d].collect(average, self.network.distribution, self.draws)
+        self._learn(d, self.moves[d].player)
+
+    def move_phi(self) -> None:
+        """The same in all domains, for what all players share."""
+        self._learn(len(self.moves), len(self.players))
+
+    def _learn(self, move: int, part: int) -> None:
+        """Collect in the environments of a move, and improve a part."""
+        average, distribution = self.network.frozen(self.players), self.network.distribution
+        rollout = self.collectors[move].collect(average, distribution, self.draws)
         self.num_frames += rollout.values[0].numel()
-        self.improve(self.moves[d].player, rollout.frames())
+        frames, sizes, factors = rollout.frames(), self.sizes[move], None
+        if penalty := self.settings.variance_penalty:
+            by_domain = variance_factors(frames.returns, sizes, penalty)
+            frames = frames._replace(advantages=by_domain * frames.advantages)
+        if penalty := self.settings.scale_penalty:
+            entropies = distribution.entropy(average(frames.observations)[0])
+            slopes = frames.log_probabilities + entropies
+            factors = scale_factors(slopes, frames.advantages, sizes, penalty)
+        self.improve(part, frames, factors)
 
-    def improve(self, d: int, frames: Rollout) -> None:
-        """Some epochs of PPO for player d on frames ``[R, F]``, while the others stand still.
+    def improve(self, d: int, frames: Rollout, factors: Tensor | None = None) -> None:
+        """Some epochs of PPO for part d on frames ``[R, F]``, while all others stand still.
 
-        The player sees its own outputs only through the average, so they carry the factor 1 / E.
+        A player sees its own outputs only through the average, so they carry the factor 1 / E.
+        ``factors [R, F]`` are those of a penalty on the scale of scores.
         """
-        settings, player = self.settings, self.players[d]
-        distribution, share = self.network.distribution, 1 / len(self.players)
-        others = self._others(d, frames.observations)
+        settings, share = self.settings, 1 / len(self.players)
+        distribution, others = self.network.distribution, self._others(d, frames.observations)
+        columns = others if factors is None else [*others, factors]
         if settings.normalize_advantages == "rollout":
             frames = frames._replace(advantages=standardize(frames.advantages))
         for epoch in range(settings.num_epochs):
             skip = settings.skip_last_frames and epoch % 2 == 1
-            for batch, theirs in minibatches(frames, others, settings, self.orders, skip):
-                (parameters, values), pull_back = self.network.vjp(player, batch.observations)
+            for batch, more in minibatches(frames, columns, settings, self.orders, skip):
+                (parameters, values), pull_back = self._vjp(d, batch.observations)
+                parameters, values = share * parameters, share * values
                 if others:
-                    parameters = theirs[0] + share * parameters
-                    values = theirs[1] + share * values
-                slopes = loss_gradient(distribution, parameters, values, batch, settings)
+                    parameters, values = more[0] + parameters, more[1] + values
+                outputs, rest = (parameters, values), more[len(others) :]
+                slopes = loss_gradient(distribution, *outputs, batch, settings, *rest)
                 self._descend(d, pull_back(*(share * slope for slope in slopes)))
+
+    def _vjp(self, d: int, observations: Tensor) -> tuple[Outputs, PullBack]:
+        """Sums of the outputs that part d has a part in; from their slopes to those in its weights.
+
+        Phi has a part in all players' outputs, so its slopes are the sum over players.
+        """
+        found = [self._vjp_of_player(self.players[e], observations) for e in self.movers[d]]
+        outputs, pull_backs = zip(*found, strict=True)
+        names, own = list(self.players[0]), self.parts[d]
+
+        def pull_back(*slopes: Tensor) -> list[Tensor]:
+            by_player = zip(*(back(*slopes) for back in pull_backs), strict=True)
+            return [
+                reduce(torch.add, slopes)
+                for name, slopes in zip(names, by_player, strict=True)
+                if name in own
+            ]
+
+        parameters, values = (reduce(torch.add, each) for each in zip(*outputs, strict=True))
+        return (parameters, values), pull_back
+
+    def _vjp_of_player(self, player: Weights, observations: Tensor) -> tuple[Outputs, PullBack]:
+        network, probability = self.network, self.settings.dropout
+        if not probability:
+            return network.vjp(player, observations)
+        factors = dropout_factors(network, player, probability, self.dropouts)
+        return vjp_with_dropout(network, player, observations, factors)
 
     def _others(self, d: int, observations: Tensor) -> list[Tensor]:
         """What the others contribute to the average; nothing where there are none."""
-        others = [player for e, player in enumerate(self.players) if e != d]
+        others = [player for e, player in enumerate(self.players) if e not in self.movers[d]]
         if not others:
             return []
         share = 1 / len(self.players)
@@ -302,7 +409,24 @@ class Training:
             collector.restore(own)
 
     def _generators(self) -> list[np.random.Generator]:
-        return [*self.draws, *self.resets, *self.orders]
+        return [*self.draws, *self.resets, *self.orders, *self.dropouts]
+
+
+def _check_needs(
+    network: Network | OnTable, owned: Sequence[Sequence[int]], settings: PPOSettings
+) -> None:
+    for name in ("variable_phi", "dropout"):
+        if getattr(settings, name) and not network.phi:
+            raise ValueError(f"{name} = {getattr(settings, name)}: needs a network that has a phi")
+    if settings.variance_penalty and any(len(domains) < 2 for domains in owned):
+        raise ValueError(
+            f"variance_penalty = {settings.variance_penalty}: needs players of several domains"
+        )
+    if settings.scale_penalty and network.distribution is not Categorical:
+        raise ValueError(
+            f"scale_penalty = {settings.scale_penalty}: needs actions to choose from, whose scores "
+            "can be scaled"
+        )
 
 
 def minibatches(
@@ -332,6 +456,7 @@ def clipped_loss(
     values: Tensor,
     batch: Rollout,
     settings: PPOSettings,
+    factors: Tensor | None = None,
 ) -> Tensor:
     """PPO's loss ``[R]``, to be minimised, on a minibatch ``[R, B]``::
 
@@ -339,14 +464,20 @@ def clipped_loss(
         + w_v mean max((V - G)^2, (clip(V, V_old - c, V_old + c) - G)^2),
         rho = pi(a | o) / pi_old(a | o)
 
-    G are the returns of the rollout.
+    G are the returns of the rollout. With ``factors f [R, B]`` of
+    :func:`ipo.penalties.scale_factors` there is one term more::
+
+        mean f clip(rho, 1 - c, 1 + c) A (log pi(a | o) + H(pi))
     """
     gain, near_gain, error, near_error = _terms(distribution, parameters, values, batch, settings)
-    return (
+    loss = (
         -torch.minimum(gain, near_gain).mean(1)
         - settings.entropy_weight * distribution.entropy(parameters).mean(1)
         + settings.value_weight * torch.maximum(error**2, near_error**2).mean(1)
     )
+    if factors is None:
+        return loss
+    return loss + (factors * near_gain * _slope(distribution, parameters, batch)).mean(1)
 
 
 def loss_gradient(
@@ -355,21 +486,35 @@ def loss_gradient(
     values: Tensor,
     batch: Rollout,
     settings: PPOSettings,
+    factors: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Of :func:`clipped_loss` in each frame's parameters ``[R, B, P]`` and value ``[R, B]``::
 
         - (1/B) [rho A grad log pi(a | o) + w_e grad H(pi)],        (2 w_v / B) (V - G)
 
     without rho A and V - G where the minimum and the maximum are those of the clipped numbers,
-    which are constant. By hand, for torch would take four times as long.
+    which are constant. By hand, for torch would take four times as long. The term with factors
+    needs no more than these gradients, since that of log pi + H is their sum.
     """
     gain, near_gain, error, near_error = _terms(distribution, parameters, values, batch, settings)
     share = 1 / values.shape[1]
     weights = -share * gain.masked_fill(near_gain < gain, 0.0)
-    entropy_weight = -share * settings.entropy_weight
+    entropy_weight: float | Tensor = -share * settings.entropy_weight
+    if factors is not None:
+        slope = _slope(distribution, parameters, batch)
+        inside = gain.masked_fill(gain != near_gain, 0.0)
+        weights = weights + share * factors * (inside * slope + near_gain)
+        entropy_weight = (entropy_weight + share * factors * near_gain).unsqueeze(-1)
     of_parameters = distribution.gradient(parameters, batch.actions, weights, entropy_weight)
     of_values = error.masked_fill(near_error**2 > error**2, 0.0)
     return of_parameters, 2 * share * settings.value_weight * of_values
+
+
+def _slope(distribution: type[Distribution], parameters: Tensor, batch: Rollout) -> Tensor:
+    """Of log pi(a | o) in a factor on all scores, ``[R, B]``: log pi(a | o) + H(pi)."""
+    return distribution.log_probability(parameters, batch.actions) + distribution.entropy(
+        parameters
+    )
 
 
 def _terms(

@@ -42,21 +42,64 @@ def averaged(players, images):
 def train(players, envs, s, draws, orders, seeds, at_once=True, movers=None):
     """Yields the players after every update; ``envs[m]`` is the list that move m acts in.
 
-    Move m is that of player ``movers[m]``, or of player m. ``seeds[m]`` are those of the first
-    resets; ``draws`` and ``orders`` are the generators of actions and of the minibatches. The
-    network is called for what all environments show ``at_once``, or for each of them alone.
+    Move m is that of player ``movers[m]``, or of player m. Where Phi is variable, all players have
+    the convolutions of the first, and the last of ``envs`` are those that Phi moves in.
+    ``seeds[m]`` are those of the first resets; ``draws`` and ``orders`` are the generators of
+    actions and of the minibatches. The network is called for what all environments show
+    ``at_once``, or for each of them alone.
     """
     like = next(players[0].parameters())
-    optimizers = [torch.optim.Adam(player.parameters(), s.learning_rate) for player in players]
+    parts = [list(player.parameters()) for player in players]
+    moves = list(enumerate(movers or range(len(players)))) * s.num_inner_rounds
+    if s.variable_phi:
+        parts = [[*player.actor.parameters(), *player.critic.parameters()] for player in players]
+        parts.append(list(players[0].convolutions.parameters()))
+        moves.insert(0, (len(envs) - 1, len(players)))
+        for player in players:
+            player.convolutions = players[0].convolutions
+    optimizers = [
+        torch.optim.AdamW(part, s.learning_rate, weight_decay=s.weight_decay) for part in parts
+    ]
     seen = [
         [env.reset(seed=seed)[0] for env, seed in zip(*own, strict=True)]
         for own in zip(envs, seeds, strict=True)
     ]
     for _ in range(s.num_updates):
-        for m, d in enumerate(movers or range(len(players))):
+        for m, d in moves:
             rollout = collect(players, envs[m], seen[m], s, draws, like, at_once)
-            improve(players, d, optimizers[d], rollout, s, orders)
+            if s.variance_penalty:
+                make_returns_alike(rollout, s)
+            if s.scale_penalty:
+                measure_scale(players, rollout, s)
+            improve(players, parts[d], optimizers[d], rollout, s, orders)
         yield players
+
+
+def make_returns_alike(rollout, s):
+    """The gradient of (R_0 + R_1) / 2 - penalty (R_0 - R_1)^2 / 4; frames of domain 0 come first.
+
+    The last factor is the variance of two numbers.
+    """
+    half = len(rollout["gains"]) // 2
+    apart = rollout["returns"][:half].mean() - rollout["returns"][half:].mean()
+    rollout["gains"][:half] *= 1 - s.variance_penalty * apart
+    rollout["gains"][half:] *= 1 + s.variance_penalty * apart
+
+
+def measure_scale(players, rollout, s):
+    """Twice the penalty times the slope of each half's return in a factor on all logits."""
+    factor = torch.ones((), dtype=rollout["gains"].dtype, requires_grad=True)
+    logits = averaged(players, rollout["images"])[0].detach()
+    policy = torch.distributions.Categorical(logits=factor * logits)
+    ratio = torch.exp(policy.log_prob(rollout["actions"]) - rollout["log_probabilities"])
+    halves = (ratio * rollout["gains"]).chunk(2)
+    slopes = [torch.autograd.grad(half.mean(), factor, retain_graph=True)[0] for half in halves]
+    rollout["factors"] = torch.cat(
+        [
+            2 * s.scale_penalty * slope * torch.ones_like(half).detach()
+            for slope, half in zip(slopes, halves, strict=True)
+        ]
+    )
 
 
 def collect(players, envs, seen, s, draws, like, at_once):
@@ -105,12 +148,12 @@ def collect(players, envs, seen, s, draws, like, at_once):
         "log_probabilities": torch.stack(chosen, dim=1).flatten(),
         "values": torch.stack(values[:-1], dim=1).flatten(),
         "gains": gains.T.flatten(),
+        "returns": torch.stack(values[:-1], dim=1).flatten() + gains.T.flatten(),
     }
 
 
-def improve(players, d, optimizer, rollout, s, orders):
-    """Epochs of PPO for player d; frames are numbered environment by environment."""
-    own = list(players[d].parameters())
+def improve(players, own, optimizer, rollout, s, orders):
+    """Epochs of PPO for some weights; frames are numbered environment by environment."""
     for epoch in range(s.num_epochs):
         numbers = np.arange(len(rollout["gains"]))
         if s.skip_last_frames and epoch % 2 == 1:
@@ -131,7 +174,7 @@ def loss(players, frames, s):
     logits, values = averaged(players, frames["images"])
     policy = torch.distributions.Categorical(logits=logits)
     old_values, gains = frames["values"], frames["gains"]
-    returns = old_values + gains
+    returns = frames["returns"]
     if s.normalize_advantages == "minibatch":
         gains = (gains - gains.mean()) / (gains.std() + 1e-8)
     ratio = torch.exp(policy.log_prob(frames["actions"]) - frames["log_probabilities"])
@@ -140,4 +183,8 @@ def loss(players, frames, s):
     clipped_values = old_values + torch.clamp(values - old_values, -s.clip, s.clip)
     value_loss = torch.max((values - returns) ** 2, (clipped_values - returns) ** 2).mean()
     entropy = policy.entropy().mean()
+    if "factors" in frames:
+        expected = (policy.probs * logits).sum(1)
+        slope = logits[range(len(logits)), frames["actions"]] - expected
+        policy_loss = policy_loss + (frames["factors"] * clipped_ratio * gains * slope).mean()
     return policy_loss + s.value_weight * value_loss - s.entropy_weight * entropy

@@ -66,7 +66,7 @@ class ImageNetwork(VectorNetwork):
             convolutions[f"conv{len(convolutions) + 1}"] = (9 * channels, units)
             channels, sides = units, [(side + 1) // 2 for side in sides]
         super().__init__(channels * sides[0] * sides[1], num_actions, distribution, hidden)
-        self.convolutions = list(convolutions)
+        self.convolutions = self.phi = list(convolutions)
         self.shapes |= convolutions
 
     def __call__(self, weights: Weights, observations: Tensor) -> Outputs:

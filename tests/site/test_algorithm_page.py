@@ -21,6 +21,8 @@ from ipo import game, lqr_learners, ppo
         lqr_learners.ipo_variable_phi,
         ppo.Training.update,
         ppo.Training.respond,
+        ppo.Training.move_phi,
+        ppo.Training._learn,
         ppo.Training.improve,
     ],
     ids=lambda function: function.__qualname__,

@@ -6,7 +6,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from experiments import lqr, lqr_turns
+from experiments import lqr, lqr_turns, regularizers
 from experiments.experiment import filled
 from experiments.paper import read_paper
 from experiments.store import Store, asked
@@ -34,6 +34,7 @@ ASKED = {  # cells and number of runs
     "optimizers": (lqr.optimizer_cells([2, 5, 10], 1000, 5000), 10),
     "outside": (lqr.published_cells(2, 1000, 5000), 2),
     "controls": (lqr.control_cells([2, 5, 10], 1000, 5000), 10),
+    "regularized": (regularizers.lqr_cells(5, 1000, 5000), 10),
     "turns": (lqr_turns.turn_cells(SIZES, [(2, 1000), (5, 1000), (10, 1000)], 5000), 10),
 }
 UNREACHED = pytest.mark.xfail(strict=True, reason="no reading of the unpublished start reaches it")

@@ -12,7 +12,8 @@ import torch
 from minigrid.core.constants import OBJECT_TO_IDX
 
 from experiments import keys as experiment
-from experiments.experiment import rebuilt
+from experiments import keys_in_full, regularizers
+from experiments.experiment import filled, rebuilt
 from experiments.keys import (
     EXPERIMENTS,
     Cell,
@@ -309,6 +310,8 @@ SHIPPED = {
         for method in ("ppo", "ipo")
         for length in ("", "_long")
     },
+    "in_full": {(arm.label, TWO, "integer", 5): 50 for arm in keys_in_full.full_arms(20)},
+    "regularized": {(label, TWO, "integer", 5): 25 for label in regularizers.KEYS.settings},
     "curves": {(method, TWO, "integer", 5): 30 for method in ("ppo", "ipo", "ensemble")},
 }
 CELLS = [(name, *cell) for name, cells in SHIPPED.items() for cell in cells]
@@ -365,11 +368,11 @@ def settings_of(label: str, color_encoding: str) -> dict:
     return asdict(replace(settings, num_updates=80 if label.endswith("_long") else 20))
 
 
-@pytest.mark.parametrize("name", SHIPPED)
+@pytest.mark.parametrize("name", ["main", "turns", "variants", "larger", "curves"])
 def test_shipped_rows_are_of_the_published_settings(name):
     for batch in batches(name):
         label, encoding = batch["columns"]["method"], batch["columns"]["color_encoding"]
-        assert batch["cell"]["settings"] == settings_of(label, encoding)
+        assert filled(Cell, batch["cell"])["settings"] == settings_of(label, encoding)
         assert "+".join(batch["cell"]["train_colors"]) == batch["columns"]["train_colors"]
 
 
@@ -405,7 +408,8 @@ def test_shipped_curves_end_where_the_shipped_runs_end(shipped):
 
 # ------------------------------------------------------------------------ shipped policies
 
-POLICY_CELLS = [cell for cell in CELLS if cell[0] != "curves"]
+WITHOUT_POLICIES = ("curves", "in_full", "regularized")
+POLICY_CELLS = [cell for cell in CELLS if cell[0] not in WITHOUT_POLICIES]
 
 
 def test_every_arm_ships_its_policies():
@@ -482,10 +486,12 @@ def test_shipped_policies_have_every_shipped_metric(shipped, keys_of, method):
         ("main", experiment.main_arms(20)),
         ("variants", experiment.variant_arms(20)),
         ("larger", experiment.larger_arms(20, 6)),
+        ("in_full", keys_in_full.full_arms(20)),
+        ("regularized", regularizers.keys_arms(20)),
     ],
 )
 def test_arms_of_the_chapter_are_those_of_the_shipped_rows(name, arms):
-    cells = {json.dumps(batch["cell"]) for batch in batches(name)}
+    cells = {json.dumps(filled(Cell, batch["cell"])) for batch in batches(name)}
     assert {json.dumps(asdict(cell)) for cell in arms} == cells
     assert len(arms) == len(SHIPPED[name])
 
@@ -494,6 +500,7 @@ def test_every_arm_of_a_table_has_a_name():
     labels = {name: {cell[0] for cell in cells} for name, cells in SHIPPED.items()}
     assert experiment.MAIN.keys() == labels["main"]
     assert experiment.LARGER.keys() == labels["larger"]
+    assert keys_in_full.NAMES.keys() == labels["in_full"] | {"ipo"}
     others = {arm for arm in labels["variants"] if arm.endswith(("3colors", "normalized"))}
     assert experiment.setting_names(experiment.TRAINED).keys() == others | {"ppo", "ipo"}
 
@@ -505,6 +512,8 @@ def test_arms_of_other_colours_differ_in_the_colours_alone():
         (experiment.main_arms, [20]),
         (experiment.variant_arms, [20]),
         (experiment.larger_arms, [20, 6]),
+        (keys_in_full.full_arms, [20]),
+        (regularizers.keys_arms, [20]),
     ):
         for usual, other in zip(make(*options), make(*options, colors), strict=True):
             fixed = usual.label.endswith("_inside")
@@ -620,6 +629,18 @@ def test_encodings_keep_the_arms_of_each_network_apart(shipped):
         assert [COLORS[code] for code in rows["code"]] == rows["domain"].tolist()
         source = shipped["main"] if arms is MAIN else variants[variants.color_encoding == encoding]
         assert runs_of(rows, "ipo", "blue").equals(runs_of(source, f"ipo{suffix}", "blue"))
+
+
+def test_frames_of_the_algorithm_in_full_are_counted_as_training_counts_them(tables):
+    """Phi's, and those of every inner round."""
+    task = Keys(tables)
+    for arm in keys_in_full.full_arms(20):
+        tiny = replace(arm, settings=replace(arm.settings, **TINY))
+        *_, (frames, _) = task.train(tiny, [0])
+        assert keys_in_full.num_frames(tiny) == frames
+    published_frames = 122_880
+    short = [arm for arm in keys_in_full.full_arms(20) if arm.label.endswith("_short")]
+    assert [keys_in_full.num_frames(arm) for arm in short] == [published_frames] * 2
 
 
 def test_steps_of_the_task_follow_one_another(shipped):

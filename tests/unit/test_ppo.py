@@ -92,17 +92,20 @@ def of_gymnasium(
 def plain_runs(settings: PPOSettings, num_domains: int, seeds: Sequence[int]) -> list[list]:
     """What the plain loop makes of every run: its players after the last update."""
     movers, owned = zip(*settings.moves(num_domains), strict=True)
-    copies = settings.num_envs // sum(map(len, owned))
+    copies = [settings.num_envs // sum(map(len, owned))] * len(owned)
+    if settings.variable_phi:
+        owned += (list(range(num_domains)),)
+        copies.append(settings.num_envs // num_domains)
     finished = []
     for r, seed in enumerate(seeds):
         draws, _, orders = streams(seed)
         players = [plain_network(DoubleNetwork().start([draws])) for _ in set(movers)]
         envs, firsts = [], []
-        for domains in owned:
-            fast = of_gymnasium(domains, [copies] * len(domains), seeds)
+        for domains, number in zip(owned, copies, strict=True):
+            fast = of_gymnasium(domains, [number] * len(domains), seeds)
             num_copies = fast.envs.num_envs // len(seeds)
             firsts.append(fast.seeds[r * num_copies : (r + 1) * num_copies])
-            envs.append([short_task(d) for d in domains for _ in range(copies)])
+            envs.append([short_task(d) for d in domains for _ in range(number)])
         *_, players = plain_ppo.train(players, envs, settings, draws, orders, firsts, movers=movers)
         finished.append(players)
     return finished
@@ -126,6 +129,11 @@ ARMS = {
     "published IPO": ("ipo", 2, {"time_outs": "terminal", "skip_last_frames": True}),
     "ensemble": ("ensemble", 2, {"num_envs": 8}),
     "one domain at a time": ("in_turn", 2, {}),
+    "variable Phi": ("ipo", 2, {"variable_phi": True}),
+    "variable Phi, two inner rounds": ("ipo", 2, {"variable_phi": True, "num_inner_rounds": 2}),
+    "weight decay": ("ppo", 2, {"weight_decay": 1.0}),
+    "penalty on the variance": ("ppo", 2, {"variance_penalty": 3.0}),
+    "penalty on the scale": ("ppo", 2, {"scale_penalty": 30.0}),
     "other numbers": (
         "ipo",
         2,
@@ -149,7 +157,9 @@ def test_learns_what_the_plain_loop_learns(method, num_domains, changes):
     network = DoubleNetwork()
     training = Training(network, of_gymnasium, num_domains, settings, seeds)
     *_, (num_frames, players) = training.reports()
-    assert num_frames == settings.num_updates * settings.num_envs * settings.num_steps
+    in_a_round = settings.num_inner_rounds + settings.variable_phi
+    frames_of_all = settings.num_envs * settings.num_steps
+    assert num_frames == settings.num_updates * in_a_round * frames_of_all
     assert_same_players(players, plain_runs(settings, num_domains, seeds))
 
 
@@ -217,6 +227,31 @@ def test_one_domain_makes_every_method_ppo(keys, method):
         for name in ("ppo", method)
     )
     assert all(torch.equal(ppo[name], other[name]) for name in ppo)
+
+
+def test_inner_rounds_are_rounds_where_phi_is_fixed(pair):
+    """So K means something only where Phi is variable, or where frames are not counted."""
+    many = PPOSettings("ipo", **(SMALL | {"num_updates": 4}))
+    inner = PPOSettings("ipo", **(SMALL | {"num_updates": 2, "num_inner_rounds": 2}))
+    for ours, theirs in zip(trained(pair, inner, [0]), trained(pair, many, [0]), strict=True):
+        assert all(torch.equal(ours[name], theirs[name]) for name in theirs)
+
+
+def test_players_share_phi_where_it_is_variable_and_nothing_else(pair):
+    settings = PPOSettings("ipo", **(SMALL | {"variable_phi": True}))
+    first, second = trained(pair, settings, [0, 1])
+    shared = {name for name in first if torch.equal(first[name], second[name])}
+    assert shared == {name for name in first if name.startswith("conv")}
+
+
+@pytest.mark.parametrize("part", [0, 1, 2])
+def test_only_the_part_whose_turn_it_is_moves(part):
+    settings = PPOSettings("ipo", minibatch_size=8, num_steps=6, variable_phi=True)
+    training = in_training(settings, num_players=2)
+    before = [row.clone() for row in training.rows]
+    training.improve(part, random_frames().frames())
+    moved = [not torch.equal(*rows) for rows in zip(before, training.rows, strict=True)]
+    assert moved == [number == part for number in range(3)]
 
 
 def test_ppo_is_the_pooled_game():
@@ -594,7 +629,8 @@ def test_gradient_is_zero_where_the_ratio_is_clipped():
 @pytest.mark.parametrize("distribution", [Categorical, Gaussian])
 @pytest.mark.parametrize("dtype, rtol", [(torch.float64, 1e-12), (torch.float32, 1e-5)])
 @pytest.mark.parametrize("normalize", ["none", "minibatch"])
-def test_gradient_of_the_loss_is_that_of_torch(distribution, dtype, rtol, normalize):
+@pytest.mark.parametrize("scaled", [False, True])
+def test_gradient_of_the_loss_is_that_of_torch(distribution, dtype, rtol, normalize, scaled):
     """On frames of which many are clipped, in the ratio, in the value, in both and in neither."""
     generator = torch.Generator().manual_seed(0)
 
@@ -610,10 +646,11 @@ def test_gradient_of_the_loss_is_that_of_torch(distribution, dtype, rtol, normal
     old = distribution.log_probability(parameters, actions) + 0.3 * normal()
     batch = Rollout(values, actions, old, values + 0.3 * normal(), normal(), normal())
     settings = PPOSettings("ppo", normalize_advantages=normalize)
+    factors = normal() if scaled else None
     leaves = [x.clone().requires_grad_() for x in (parameters, values)]
-    loss = clipped_loss(distribution, *leaves, batch, settings)
+    loss = clipped_loss(distribution, *leaves, batch, settings, factors)
     expected = torch.autograd.grad(loss.sum(), leaves)
-    found = loss_gradient(distribution, parameters, values, batch, settings)
+    found = loss_gradient(distribution, parameters, values, batch, settings, factors)
     for ours, theirs in zip(found, expected, strict=True):
         constant = ours == 0  # where the entropy has no say: in the values
         assert_close(ours, theirs, rtol)
@@ -719,6 +756,8 @@ def test_every_second_epoch_leaves_out_the_last_frames(num_epochs):
 def test_published_settings_are_the_papers():
     paper = {
         "num_updates": 20,
+        "num_inner_rounds": 1,
+        "variable_phi": False,
         "num_envs": 48,
         "num_steps": 128,
         "num_epochs": 4,
@@ -735,6 +774,10 @@ def test_published_settings_are_the_papers():
         "normalize_advantages": "none",
         "time_outs": "terminal",
         "skip_last_frames": True,
+        "weight_decay": 0.0,
+        "dropout": 0.0,
+        "variance_penalty": 0.0,
+        "scale_penalty": 0.0,
     }
     for method, learning_rate in (("ppo", 1e-3), ("ipo", 5e-4), ("ensemble", 1e-3)):
         expected = paper | {"method": method, "learning_rate": learning_rate, "reward_clip": 10.0}

@@ -179,10 +179,13 @@ def flat(training: Training) -> Tensor:
     return torch.cat([w.detach().flatten() for p in training.players for w in p.values()])
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_a_restored_training_goes_on_as_if_nothing_had_happened(method):
+@pytest.mark.parametrize(
+    ("method", "more"),
+    [*((method, {}) for method in METHODS), ("ipo", {"variable_phi": True, "dropout": 0.2})],
+)
+def test_a_restored_training_goes_on_as_if_nothing_had_happened(method, more):
     changes = {"normalize_rewards": True, "normalize_advantages": "rollout", "num_steps": 18}
-    settings = PPOSettings(method, **(SMALL | changes))
+    settings = PPOSettings(method, **(SMALL | changes | more))
     whole = trainings(settings)
     for _ in range(4):
         whole.update()
@@ -194,7 +197,8 @@ def test_a_restored_training_goes_on_as_if_nothing_had_happened(method):
     for _ in range(2):
         second.update()
     assert torch.equal(flat(second), flat(whole))
-    assert second.num_frames == whole.num_frames == 4 * 4 * 18
+    moves = 1 + settings.variable_phi
+    assert second.num_frames == whole.num_frames == 4 * moves * 4 * 18
     assert not torch.equal(flat(first), flat(whole))
 
 

@@ -1,0 +1,65 @@
+"""Algorithm 1 with all its parts on the coloured keys: K inner rounds, and a variable Phi.
+
+Phi is the network's convolutions, which the players share. It moves first in a round, on rollouts
+in all domains with as many frames as those of all players together. So a round has 1 + K times the
+frames of IPO as published; arms called short have fewer rounds, and as many frames in all.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+import pandas as pd
+
+from experiments.keys import TESTED, TRAINED, Cell, arm, gap, main_arms, runs_of
+from experiments.tables import mean_and_std
+
+NAMES = {
+    "ipo": "IPO, as published",
+    "ipo_inner2": "K = 2",
+    "ipo_inner4": "K = 4",
+    "ipo_phi_short": "variable Φ, the paper's frames",
+    "ipo_phi_inner4_short": "variable Φ, K = 4, the paper's frames",
+    "ipo_phi": "variable Φ, the paper's rounds",
+}
+
+
+def full_arms(num_updates: int, train_colors: Sequence[str] = TRAINED) -> list[Cell]:
+    """All of them but IPO as published."""
+    of = partial(arm, method="ipo", train_colors=tuple(train_colors), num_updates=num_updates)
+    phi = partial(of, variable_phi=True)
+    return [
+        of("ipo_inner2", num_inner_rounds=2),
+        of("ipo_inner4", num_inner_rounds=4),
+        phi("ipo_phi_short", num_updates=math.ceil(num_updates / 2)),
+        phi("ipo_phi_inner4_short", num_updates=math.ceil(num_updates / 5), num_inner_rounds=4),
+        phi("ipo_phi"),
+    ]
+
+
+def num_frames(cell: Cell) -> int:
+    """Of a run."""
+    settings = cell.settings
+    collected = settings.num_inner_rounds + settings.variable_phi
+    return settings.num_updates * collected * settings.num_envs * settings.num_steps
+
+
+def full_table(rows: pd.DataFrame, num_updates: int, train_colors: Sequence[str]) -> pd.DataFrame:
+    """Exact returns, mean ± standard deviation, and on grey the difference to IPO as published."""
+
+    def row(cell: Cell) -> dict[str, Any]:
+        trained = pd.concat([runs_of(rows, cell.label, color) for color in train_colors], axis=1)
+        return {
+            "arm": NAMES[cell.label],
+            "rounds": cell.settings.num_updates,
+            "frames": num_frames(cell),
+            "training colours": mean_and_std(trained.mean(axis=1), 3),
+            TESTED: mean_and_std(runs_of(rows, cell.label, TESTED), 3),
+            "difference on grey": "" if cell.label == "ipo" else gap(rows, cell.label, "ipo"),
+        }
+
+    ipo = next(cell for cell in main_arms(num_updates, train_colors) if cell.label == "ipo")
+    return pd.DataFrame(map(row, [ipo, *full_arms(num_updates, train_colors)]))
