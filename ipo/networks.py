@@ -369,6 +369,7 @@ class DenseOnTable(DenseNetwork):
 
     def average(self, players: Sequence[Weights]) -> Outputs:
         """What the players' average makes of the whole table: ``[R, K, A]`` and ``[R, K]``."""
+        self._check(players)
         num_runs = len(next(iter(players[0].values())))
         return super().frozen(players)(self.table.expand(num_runs, -1, -1))
 
