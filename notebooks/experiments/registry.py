@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from experiments import causality, cue, keys, lqr, own_domains
+from experiments import causality, keys, lqr, own_domains
+from experiments.cue import training as cue
 from experiments.doors import success as door
 from experiments.experiment import Experiment, Places
 from experiments.games import scalar as algorithm

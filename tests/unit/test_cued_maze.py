@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from experiments.cue_theory import STRENGTH
+from experiments.cue.theory import STRENGTH
 from ipo.worlds.cued_maze import FORWARD, LANDMARK, LEFT, RIGHT, cued_maze
 from ipo.worlds.tabular import expected_return
 

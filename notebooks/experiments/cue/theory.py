@@ -13,7 +13,7 @@ A tends to 1, it follows the landmark where B > 1/2 and the cue where B < 1/2.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import pandas as pd
@@ -34,13 +34,12 @@ GROUPS = {2: (1, 1), 3: (2, 1), 4: (3, 1)}  # domains with the first and with th
 Cues = tuple[float, ...]
 
 
-def points(num_domains: int) -> list[Cues]:
+def points(num_domains: int, values: Sequence[float]) -> list[Cues]:
     """Cues of the training domains at all points of a phase diagram.
 
-    Cues may be renamed, so the first one is positive. With two domains the first one is the
-    stronger; with more, it is that of the majority.
+    Cues may be renamed, so the first one is positive. With two domains it is the stronger; with
+    more, that of the majority.
     """
-    values = STRONGER if num_domains == 2 else COARSE
     others = [*(-v for v in reversed(values)), *values]
     first, second = GROUPS[num_domains]
     return [
@@ -50,9 +49,9 @@ def points(num_domains: int) -> list[Cues]:
     ]
 
 
-def disputed() -> list[Cues]:
-    """Points at which each of two domains prefers its cue to the landmark, with opposite signs."""
-    return [cues for cues in points(2) if cues[0] > STRENGTH and cues[1] < -STRENGTH]
+def disputed(values: Sequence[float]) -> list[Cues]:
+    """Points where each of two domains prefers its cue to the landmark, with opposite signs."""
+    return [c for c in points(2, values) if c[0] > STRENGTH and c[1] < -STRENGTH]
 
 
 # -------------------------------------------------------------------------------- the rules
@@ -110,22 +109,28 @@ RULES: dict[str, Callable[[Sequence[float]], str]] = {
 }
 
 
-def predictions() -> pd.DataFrame:
-    """What each method follows at every point, by encoding of the observations.
+def predicted(encoding: str, cues: str, method: str) -> str:
+    """What a method follows.
 
     Where observations have no signs in common (``one_hot``), each has a vote of its own. At
-    disputed points two opposite wishes meet at both observations: players learn nothing.
+    disputed points two opposite wishes meet at both observations, and players learn nothing.
     """
-    return pd.DataFrame(_predictions(), columns=["encoding", "cues", "method", "follows"])
+    if encoding == "one_hot" and method == "ipo":
+        return NEITHER
+    return RULES[method]([float(c) for c in cues.split()])
 
 
-def _predictions() -> Iterator[tuple[str, str, str, str]]:
-    for num_domains in GROUPS:
-        for cues, (method, rule) in itertools.product(points(num_domains), RULES.items()):
-            yield "signs", text(cues), method, rule(cues)
-    for cues in disputed():
-        yield "one_hot", text(cues), "ppo", pooled(cues)
-        yield "one_hot", text(cues), "ipo", NEITHER
+def predictions() -> pd.DataFrame:
+    """Of each method at every point, as they were committed before any was trained there."""
+    grids = {2: STRONGER, 3: COARSE, 4: COARSE}
+    diagrams = [("signs", points(n, grid), RULES) for n, grid in grids.items()]
+    control = ("one_hot", disputed(STRONGER), ("ppo", "ipo"))
+    lines = [
+        (encoding, text(cues), method, predicted(encoding, text(cues), method))
+        for encoding, where, methods in (*diagrams, control)
+        for cues, method in itertools.product(where, methods)
+    ]
+    return pd.DataFrame(lines, columns=["encoding", "cues", "method", "follows"])
 
 
 def text(cues: Sequence[float]) -> str:

@@ -1,0 +1,102 @@
+"""What the arms of the cued maze come to, beside what was predicted."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pandas as pd
+
+from experiments.cue import theory
+from experiments.cue.theory import CUE_WINS, LANDMARK_WINS, NEITHER
+from ipo.stats import holm, paired_difference
+from ipo.worlds.cued_maze import LANDMARK
+
+NAMES = {
+    "ppo": "PPO",
+    "in_turn": "one network, one domain at a time",
+    "ensemble": "ensemble, pooled data",
+    "ipo": "IPO",
+    "vrex": "V-REx",
+}
+MARGIN = 0.1  # a difference of returns that counts
+HALF = LANDMARK / 2  # between the returns of following landmark and cue where the cue is wrong
+INFORMED = (0.5 + LANDMARK) / 2  # between chance and the landmark, where the cue says nothing
+
+
+def by_run(rows: pd.DataFrame) -> pd.DataFrame:
+    """What runs are judged by: a line for each run with three columns.
+
+    A return is linear in the cue, so those at both extremes tell everything: ``worst`` is the
+    return in the worst of *all* domains, ``plain`` that without a cue, ``use`` what the cue adds.
+    """
+    wide = rows.pivot(index=["encoding", "cues", "method", "run"], columns="domain", values="value")
+    wrong, right = wide["-1"], wide["1"]
+    worst, plain = np.minimum(wrong, right), (wrong + right) / 2
+    return pd.DataFrame({"worst": worst, "plain": plain, "use": right - wrong})
+
+
+def with_chosen_penalty(runs: pd.DataFrame) -> pd.DataFrame:
+    """The same with V-REx once: with the penalty that the training domains of a point choose."""
+    parts = [runs.drop([m for m in runs.index.unique("method") if m.startswith("vrex")], level=2)]
+    for (encoding, cues), mean in _means(runs).groupby(level=["encoding", "cues"]):
+        use = {
+            int(method.removeprefix("vrex_")): mean["use"][encoding, cues, method]
+            for method in mean.index.unique("method")
+            if method.startswith("vrex")
+        }
+        if use:
+            strengths = [float(c) for c in cues.split()]
+            spreads = {penalty: theory.spread(strengths, u) for penalty, u in use.items()}
+            method = f"vrex_{theory.chosen_penalty(spreads)}"
+            parts.append(runs.loc[[(encoding, cues, method)]].rename({method: "vrex"}, level=2))
+    return pd.concat(parts)
+
+
+def _means(runs: pd.DataFrame) -> pd.DataFrame:
+    return runs.groupby(level=["encoding", "cues", "method"]).mean()
+
+
+def follows(worst: float, plain: float) -> str:
+    """What the policies of an arm follow at a point, by their mean returns."""
+    if worst < HALF:
+        return CUE_WINS
+    return LANDMARK_WINS if plain >= INFORMED else NEITHER
+
+
+def outcomes(runs: pd.DataFrame) -> pd.Series:
+    """:func:`follows` of every arm and point."""
+    mean = _means(runs)
+    return mean.apply(lambda line: follows(line["worst"], line["plain"]), axis=1)
+
+
+def beside_predictions(runs: pd.DataFrame) -> pd.DataFrame:
+    """What the rules say, and what came out, for every arm and point that was run."""
+    found = outcomes(runs)
+    predicted = [theory.predicted(*key) for key in found.index]
+    return pd.DataFrame({"predicted": predicted, "found": found})
+
+
+def predicted_difference(ipo: str, other: str) -> str:
+    """Of the return in the worst domain, IPO's minus another's, from what they follow."""
+    order = (CUE_WINS, NEITHER, LANDMARK_WINS)
+    gained = order.index(ipo) - order.index(other)
+    return "better" if gained > 0 else "worse" if gained < 0 else "alike"
+
+
+def differences(runs: pd.DataFrame, baselines: Sequence[str]) -> pd.DataFrame:
+    """IPO minus each baseline in the worst domain, at every point, paired by run.
+
+    A difference counts if it is MARGIN or more and its p, by Holm's method over all of these, is
+    below 5 %.
+    """
+    worst = runs["worst"].unstack("method")
+    found = pd.DataFrame(
+        {"encoding": encoding, "cues": cues, "baseline": baseline}
+        | paired_difference(own["ipo"], own[baseline])._asdict()
+        for (encoding, cues), own in worst.groupby(level=["encoding", "cues"])
+        for baseline in baselines
+    )
+    counts = (np.array(holm(found["p"].tolist())) < 0.05) & (found["mean"].abs() >= MARGIN)
+    sign = np.where(found["mean"] > 0, "better", "worse")
+    return found.assign(verdict=np.where(counts, sign, "alike"))
