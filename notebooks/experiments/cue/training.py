@@ -57,7 +57,7 @@ def settings(method: str, num_updates: int) -> PPOSettings:
     """Of every arm: as many gradient steps for a player as for PPO's only one."""
     return PPOSettings(
         method,
-        learning_rate=5e-3,
+        learning_rate=1e-2,
         num_updates=num_updates,
         num_envs=144,  # a multiple of 2^2, 3^2 and 4^2, for the players of an ensemble
         num_steps=16,
