@@ -38,19 +38,18 @@ def by_run(rows: pd.DataFrame) -> pd.DataFrame:
 
 def with_chosen_penalty(runs: pd.DataFrame) -> pd.DataFrame:
     """The same with V-REx once: with the penalty that the training domains of a point choose."""
-    parts = [runs.drop([m for m in runs.index.unique("method") if m.startswith("vrex")], level=2)]
-    for (encoding, cues), mean in _means(runs).groupby(level=["encoding", "cues"]):
-        use = {
-            int(method.removeprefix("vrex_")): mean["use"][encoding, cues, method]
-            for method in mean.index.unique("method")
-            if method.startswith("vrex")
+    flat = runs.reset_index()
+    penalised = flat["method"].str.startswith("vrex_")
+    parts = [flat[~penalised]]
+    for (_, cues), own in flat[penalised].groupby(["encoding", "cues"]):
+        strengths = [float(c) for c in cues.split()]
+        spreads = {
+            int(method.removeprefix("vrex_")): theory.spread(strengths, use)
+            for method, use in own.groupby("method")["use"].mean().items()
         }
-        if use:
-            strengths = [float(c) for c in cues.split()]
-            spreads = {penalty: theory.spread(strengths, u) for penalty, u in use.items()}
-            method = f"vrex_{theory.chosen_penalty(spreads)}"
-            parts.append(runs.loc[[(encoding, cues, method)]].rename({method: "vrex"}, level=2))
-    return pd.concat(parts)
+        chosen = f"vrex_{theory.chosen_penalty(spreads)}"
+        parts.append(own[own["method"] == chosen].assign(method="vrex"))
+    return pd.concat(parts).set_index(runs.index.names)
 
 
 def _means(runs: pd.DataFrame) -> pd.DataFrame:
