@@ -25,7 +25,7 @@ Landmark = Annotated[float, partial(check_number, least=0, most=1)]
 
 @checked
 def cued_maze(
-    cue: Cue, landmark: Landmark = LANDMARK, corridor: Count = 2, horizon: Count = 10
+    cue: Cue, landmark: Landmark = LANDMARK, corridor: Count = 1, horizon: Count = 10
 ) -> TabularTask:
     """The maze of a domain: its states, and what is seen in them.
 

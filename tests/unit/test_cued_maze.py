@@ -54,7 +54,7 @@ def test_random_actions_by_counting():
             [place[0] * 2 / 3, place[0] / 3 + place[1] * 2 / 3, place[1] / 3 + place[2] / 3]
         )
     uniform = np.full(3, 1 / 3)
-    task = cued_maze(0.9, horizon=4)
+    task = cued_maze(0.9, corridor=2, horizon=4)
     assert return_of(task, lambda mark, cue: uniform, uniform) == pytest.approx(in_time / 2)
 
 

@@ -60,7 +60,7 @@ def settings(method: str, num_updates: int) -> PPOSettings:
         learning_rate=1e-2,
         num_updates=num_updates,
         num_envs=144,  # a multiple of 2^2, 3^2 and 4^2, for the players of an ensemble
-        num_steps=16,
+        num_steps=8,
         num_minibatches=4,
     )
 
