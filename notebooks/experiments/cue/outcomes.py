@@ -99,3 +99,64 @@ def differences(runs: pd.DataFrame, baselines: Sequence[str]) -> pd.DataFrame:
     counts = (np.array(holm(found["p"].tolist())) < 0.05) & (found["mean"].abs() >= MARGIN)
     sign = np.where(found["mean"] > 0, "better", "worse")
     return found.assign(verdict=np.where(counts, sign, "alike"))
+
+
+# ---------------------------------------------------------------------------------- as tables
+
+
+def score(compared: pd.DataFrame) -> pd.DataFrame:
+    """A line for each method: of how many points what was predicted came out."""
+    right = compared["predicted"] == compared["found"]
+    follows = {
+        f"{sign}: {column}": (compared[column] == sign)
+        for sign in (LANDMARK_WINS, CUE_WINS, NEITHER)
+        for column in ("predicted", "found")
+    }
+    each = (
+        pd.DataFrame({"points": 1, "as predicted": right, **follows}).groupby(level="method").sum()
+    )
+    return each.reindex([m for m in NAMES if m in each.index]).rename(index=NAMES).reset_index()
+
+
+def with_predictions(found: pd.DataFrame) -> pd.DataFrame:
+    """:func:`differences` with what was predicted of each."""
+    predicted = [
+        predicted_difference(*(theory.predicted(encoding, cues, m) for m in ("ipo", baseline)))
+        for encoding, cues, baseline in found[["encoding", "cues", "baseline"]].itertuples(
+            index=False
+        )
+    ]
+    return found.assign(predicted=predicted)
+
+
+def difference_counts(found: pd.DataFrame) -> pd.DataFrame:
+    """For each baseline: how many points were predicted to be what, and how many came out so."""
+    lines = []
+    for baseline, own in found.groupby("baseline", sort=False):
+        line: dict[str, object] = {"IPO against": NAMES[baseline]}
+        for verdict in ("better", "worse", "alike"):
+            predicted = own[own["predicted"] == verdict]
+            came = (predicted["verdict"] == verdict).sum()
+            line[f"predicted {verdict}"] = len(predicted)
+            line[f"… came out {verdict}"] = came
+            line[f"{verdict}, not predicted"] = (own["verdict"] == verdict).sum() - came
+        lines.append(line)
+    return pd.DataFrame(lines)
+
+
+def notable(found: pd.DataFrame, baseline: str) -> pd.DataFrame:
+    """The points at which IPO was predicted, or found, to differ from a baseline."""
+    own = found[found["baseline"] == baseline]
+    own = own[(own[["predicted", "verdict"]] != "alike").any(axis=1)]
+    interval = [
+        f"[{low:+.2f}, {high:+.2f}]" for low, high in zip(own["low"], own["high"], strict=True)
+    ]
+    return pd.DataFrame(
+        {
+            "cues": own["cues"],
+            "difference": own["mean"].map("{:+.2f}".format),
+            "95 % interval": interval,
+            "predicted": own["predicted"],
+            "found": own["verdict"],
+        }
+    )
