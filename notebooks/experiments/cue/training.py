@@ -53,13 +53,26 @@ class Cell:
         return {"method": method, "cues": text(self.cues), "encoding": self.encoding}
 
 
-def settings(method: str, num_updates: int) -> PPOSettings:
-    """Of every arm: as many gradient steps for a player as for PPO's only one."""
+def one_step(method: str, num_updates: int) -> PPOSettings:
+    """A player makes one gradient step on each rollout, as the theory has it."""
+    return PPOSettings(
+        method,
+        learning_rate=2e-2,
+        num_updates=num_updates,
+        num_envs=144,  # a multiple of 2^2, 3^2 and 4^2, for the players of an ensemble
+        num_steps=4,
+        num_epochs=1,
+        num_minibatches=1,
+    )
+
+
+def many_steps(method: str, num_updates: int) -> PPOSettings:
+    """A player learns from each rollout for four epochs of four minibatches, as is usual for PPO."""
     return PPOSettings(
         method,
         learning_rate=1e-2,
         num_updates=num_updates,
-        num_envs=144,  # a multiple of 2^2, 3^2 and 4^2, for the players of an ensemble
+        num_envs=144,
         num_steps=8,
         num_minibatches=4,
     )
@@ -67,12 +80,12 @@ def settings(method: str, num_updates: int) -> PPOSettings:
 
 def phase_cells(points: Sequence[Cues], num_updates: int) -> list[Cell]:
     """Every arm at every point of a diagram."""
-    ppo = settings("ppo", num_updates)
+    ppo = one_step("ppo", num_updates)
     return [
         cell
         for cues in points
         for cell in (
-            *(Cell(settings(method, num_updates), cues) for method in METHODS),
+            *(Cell(one_step(method, num_updates), cues) for method in METHODS),
             *(Cell(ppo, cues, penalty=float(p)) for p in PENALTIES),
         )
     ]
@@ -81,9 +94,16 @@ def phase_cells(points: Sequence[Cues], num_updates: int) -> list[Cell]:
 def encoding_cells(points: Sequence[Cues], num_updates: int) -> list[Cell]:
     """PPO and IPO where observations have no signs in common."""
     return [
-        Cell(settings(method, num_updates), cues, "one_hot")
+        Cell(one_step(method, num_updates), cues, "one_hot")
         for cues in points
         for method in ("ppo", "ipo")
+    ]
+
+
+def many_step_cells(points: Sequence[Cues], num_updates: int) -> list[Cell]:
+    """PPO and IPO with many steps on each rollout."""
+    return [
+        Cell(many_steps(method, num_updates), cues) for cues in points for method in ("ppo", "ipo")
     ]
 
 
@@ -157,5 +177,5 @@ def short(cell: Cell) -> Cell | None:
 
 EXPERIMENTS = {
     name: Experiment(run_cell, Cell, short)
-    for name in ("two_domains", "three_domains", "four_domains", "encodings")
+    for name in ("two_domains", "three_domains", "four_domains", "encodings", "many_steps")
 }
