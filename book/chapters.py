@@ -15,7 +15,7 @@ import sources
 from experiments.files import replace_text
 from outputs import with_outputs
 
-DATA = ("paper", "results", "policies", "witness", "bench")  # what notebooks read
+DATA = ("paper", "predictions", "results", "policies", "witness", "bench")  # what notebooks read
 
 
 @dataclass(frozen=True)

@@ -348,6 +348,42 @@ class OnTable:
         return lambda indices: (chosen_rows(logits, indices), chosen_rows(values, indices))
 
 
+class DenseOnTable(DenseNetwork):
+    """A dense actor-critic whose observations are indices of rows in a table of K distinct ones.
+
+    Args:
+        table: the observations.
+        num_actions: A.
+        hidden: units of each hidden layer.
+    """
+
+    @checked
+    def __init__(
+        self, table: Annotated[Tensor, "K O"], num_actions: Count, hidden: Sequence[Count]
+    ) -> None:
+        super().__init__(table.shape[1], num_actions, Categorical, hidden)
+        self.table = table
+
+    def __call__(self, weights: Weights, indices: Tensor) -> Outputs:
+        """``indices [R, B]`` -> logits ``[R, B, A]``, values ``[R, B]``."""
+        return super().__call__(weights, self.table[indices])
+
+    def vjp(self, weights: Weights, indices: Tensor) -> tuple[Outputs, PullBack]:
+        """As that of a dense network."""
+        return super().vjp(weights, self.table[indices])
+
+    def average(self, players: Sequence[Weights]) -> Outputs:
+        """What the players' average makes of the whole table: ``[R, K, A]`` and ``[R, K]``."""
+        self._check(players)
+        num_runs = len(next(iter(players[0].values())))
+        return super().frozen(players)(self.table.expand(num_runs, -1, -1))
+
+    def frozen(self, players: Sequence[Weights]) -> Acting:
+        """The average of ``players`` as they are now, as a function of ``indices [R, B]``."""
+        logits, values = self.average(players)
+        return lambda indices: (chosen_rows(logits, indices), chosen_rows(values, indices))
+
+
 def averaged(network: Callable[[Weights, Tensor], Outputs], players: Sequence[Weights]) -> Acting:
     """The average of a network's players, without gradients, as a function of observations."""
 

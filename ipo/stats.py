@@ -13,7 +13,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 import scipy.stats
 
-from ipo.checks import Count, Finite, Positive, checked
+from ipo.checks import Count, Finite, Positive, Probability, checked
 
 
 def _check_runs(name: str, values: object) -> None:
@@ -68,6 +68,21 @@ def paired_difference(values: Runs, baseline: Runs) -> Difference:
     # Where no run differs from the others, t is 0 / 0 or infinite.
     p = 2 * scipy.stats.t.sf(abs(mean) / error, len(difference) - 1) if error else float(mean == 0)
     return Difference(float(mean), *mean_interval(difference.tolist()), float(p))
+
+
+@checked
+def holm(p: Annotated[Sequence[Probability], "tests"]) -> list[float]:
+    """P values ``[tests]`` adjusted for their number.
+
+    In ascending order, p_(k) becomes the largest of min(1, (tests - j + 1) p_(j)), j <= k.
+
+    Source: S. Holm, A simple sequentially rejective multiple test procedure (1979).
+    """
+    order = np.argsort(p)
+    factors = np.arange(len(p), 0, -1)
+    adjusted = np.empty(len(p))
+    adjusted[order] = np.maximum.accumulate(np.minimum(factors * np.asarray(p)[order], 1))
+    return adjusted.tolist()
 
 
 @checked

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import scipy.stats
 
-from ipo.stats import Difference, paired_difference, power
+from ipo.stats import Difference, holm, paired_difference, power
 from rules.cells import shown, with_interval
 
 REPRODUCED = "reproduced"
@@ -139,17 +139,3 @@ def decided(compared: Sequence[Compared], corrected: bool = True) -> list[str]:
         holds(own.difference.mean > 0) if own_p < 0.05 else UNDECIDED
         for own, own_p in zip(compared, holm(p) if corrected else p, strict=True)
     ]
-
-
-def holm(p: Sequence[float]) -> list[float]:
-    """P values ``[num_tests]`` adjusted for their number.
-
-    In ascending order, p_(k) becomes the largest of min(1, (num_tests - j + 1) p_(j)), j <= k.
-
-    Source: S. Holm, A simple sequentially rejective multiple test procedure (1979).
-    """
-    order = np.argsort(p)
-    factors = np.arange(len(p), 0, -1)
-    adjusted = np.empty(len(p))
-    adjusted[order] = np.maximum.accumulate(np.minimum(factors * np.asarray(p)[order], 1))
-    return adjusted.tolist()

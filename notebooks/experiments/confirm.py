@@ -43,6 +43,7 @@ CONFIRMED = DATA / "confirmed.json"
 CHAOTIC = (
     *("keys/main", "keys/variants", "keys/larger", "keys/curves"),
     *("algorithm/players", "door/curves", "door/gaps"),
+    *("cue/two_domains", "cue/three_domains", "cue/four_domains", "cue/encodings"),
 )
 LEVEL, MANY = 0.001, 5
 LONGER = 10.0  # times the tolerance of a slice: rounding grows over thousands of steps

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from experiments import causality, keys, lqr, own_domains
+from experiments.cue import training as cue
 from experiments.doors import success as door
 from experiments.experiment import Experiment, Places
 from experiments.games import scalar as algorithm
@@ -16,6 +17,7 @@ DATA = ROOT / "data"
 CHAPTERS: dict[str, dict[str, Experiment]] = {
     "lqr": lqr.EXPERIMENTS,
     "keys": keys.EXPERIMENTS,
+    "cue": cue.EXPERIMENTS,
     "causality": causality.EXPERIMENTS,
     "algorithm": algorithm.EXPERIMENTS,
     "door": door.EXPERIMENTS,

@@ -42,6 +42,7 @@ TOLERANCE = {
     "algorithm": (1e-6, 1e-9),
     "algorithm/players": (1e-3, 1e-5),  # networks, as in keys
     "keys": (1e-3, 1e-5),
+    "cue": (1e-3, 1e-5),
     "door": (1e-3, 1e-5),
     "your_own_domains": (1e-2, 1e-3),  # episodes of a pendulum are chaotic
 }

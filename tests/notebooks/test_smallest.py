@@ -47,6 +47,7 @@ SMALLEST = {
         "larger_size": 5,
         "grid_sizes": [5],
     },
+    "cue": {"num_runs": 2, "num_updates": 1, "cues": [0.9], "more_cues": [0.1]},
     "door": {
         "num_runs": 2,
         "num_updates": 2,
@@ -111,6 +112,12 @@ TOGETHER: dict[str, list[dict[str, Any]]] = {
         {"num_runs_variants": 5},
         {"num_runs_curves": 4, "num_runs_live": 4},
         {"num_updates": 2, "num_updates_live": 2},
+    ],
+    "cue": [
+        {"cues": [0.9, 0.1, 0.3], "more_cues": [1.0, 0.2]},
+        {"cues": [0.2]},
+        {"num_runs": 31},
+        {"num_updates": 26, "num_workers": 2},
     ],
     "door": [
         {"num_doors": 1, "num_doors_watched": 1, "num_doors_live": 1},

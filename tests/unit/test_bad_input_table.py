@@ -40,10 +40,10 @@ from experiments.witness import side_by_side
 from ipo import game, lqr, lqr_learners, optimizers, own_domains, ppo, rollouts, stats
 from ipo.causality import icp, predictors, scm, small_games
 from ipo.distributions import Categorical
-from ipo.networks import DenseNetwork, GridNetwork, OnTable, copied
+from ipo.networks import DenseNetwork, DenseOnTable, GridNetwork, OnTable, copied
 from ipo.own_domains import copies, networks
 from ipo.own_domains import policy as policies
-from ipo.worlds import colored_keys, door, many_doors, tabular
+from ipo.worlds import colored_keys, cued_maze, door, many_doors, tabular
 
 NAN, INF = math.nan, math.inf
 
@@ -207,6 +207,8 @@ def rows_of_lqr() -> Iterator[Row]:
     yield row(stats.mean_interval, two, values=values)
     unpaired = values + bad("shape", [1.0, 2.0, 3.0])
     yield row(stats.paired_difference, two, values=values, baseline=unpaired)
+    many = NUMBERS[:2] + bad("not finite", [NAN]) + bad("probability", [0.1, 1.1], [-0.1])
+    yield row(stats.holm, {"p": [0.1, 0.2]}, p=many)
     yield row(
         stats.power, {"effect": 1.0, "spread": 2.0, "num_runs": 10}, effect=NUMBER, spread=POSITIVE
     )
@@ -259,12 +261,18 @@ def rows_of_learning() -> Iterator[Row]:
     on_table = OnTable(grid, images)
     fits = array("longer runs single")
     yield row(OnTable, {"network": grid, "table": images}, network=OBJECT, table=fits)
+    few = torch.zeros(5, 3)
+    of_table = DenseOnTable(few, 2, (4,))
+    sizes = bad("kind of object", 64, [1.5]) + bad("range", [0])
+    good = {"table": few, "num_actions": 2, "hidden": (4,)}
+    yield row(DenseOnTable, good, table=fits, hidden=sizes)
     yield row(grid.start, {"generators": generators}, generators=LIST + bad("shape", [0]))
-    for network, good in ((grid, grid), (dense, dense), (on_table, grid)):
+    for network, good in ((grid, grid), (dense, dense), (on_table, grid), (of_table, dense)):
         of_others = [DenseNetwork(2, 2).start(generators)]
         refused = LIST + bad("shape", of_others, [{}]) + bad("kind of object", [3], [{"a": 3}])
         yield row(network.frozen, {"players": [good.start(generators)]}, players=refused)
     yield row(on_table.average, {"players": [grid.start(generators)]}, players=refused)
+    yield row(of_table.average, {"players": [dense.start(generators)]}, players=refused)
     yield row(copied, {"players": [grid.start(generators)]}, players=bad("kind of object", 3, [3]))
 
     yield row(
@@ -506,6 +514,14 @@ def rows_of_worlds() -> Iterator[Row]:
         name: NUMBER + bad("range", low - 1, high + 1)
         for name, (low, high) in door.DoorParams.LIMITS.items()
     }
+    yield row(
+        cued_maze.cued_maze,
+        {"cue": 0.5},
+        cue=NUMBER + bad("range", -1.1, 1.1),
+        landmark=PROBABILITY,
+        corridor=COUNT,
+        horizon=COUNT,
+    )
     yield row(door.DoorParams, **limits)
     yield row(door.DoorParams.sample, {"generator": rng}, friction=POSITIVE[:6])
     yield row(door.build_door, {"params": params}, timestep=POSITIVE, handle_shift=SHIFT + OBJECT)

@@ -12,7 +12,17 @@ from small import DoubleNetwork, assert_close, plain_network
 from torch import Tensor
 
 from experiments.policies import load_policy, save_policy
-from ipo.networks import GridNetwork, Network, OnTable, Weights, copied, in_one_row
+from ipo.distributions import Categorical
+from ipo.networks import (
+    DenseNetwork,
+    DenseOnTable,
+    GridNetwork,
+    Network,
+    OnTable,
+    Weights,
+    copied,
+    in_one_row,
+)
 
 
 def generators(*seeds: int) -> list[np.random.Generator]:
@@ -223,6 +233,27 @@ def test_average_of_a_whole_table(num_rows):
     expected = network.frozen(players)(table.expand(2, *table.shape))
     assert_close(logits, expected[0])
     assert_close(values, expected[1])
+
+
+def test_dense_network_on_a_table_is_that_network():
+    table = torch.tensor(np.random.default_rng(0).normal(size=(6, 4))).float()
+    indices = torch.tensor([[5, 0, 0, 3], [1, 2, 5, 5]])
+    dense, on_table = DenseNetwork(4, 3, Categorical, (5,)), DenseOnTable(table, 3, (5,))
+    players = [dense.start(generators(0, 1)), dense.start(generators(2, 3))]
+    slopes = torch.ones(2, 4, 3), torch.ones(2, 4)
+    (seen, pull_back), (expected, pull_back_there) = (
+        on_table.vjp(players[0], indices),
+        dense.vjp(players[0], table[indices]),
+    )
+    there = on_table(players[0], indices)
+    acting, average = on_table.frozen(players)(indices), dense.frozen(players)(table[indices])
+    for ours, theirs in [
+        *zip(seen, expected, strict=True),
+        *zip(there, expected, strict=True),
+        *zip(acting, average, strict=True),
+        *zip(pull_back(*slopes), pull_back_there(*slopes), strict=True),
+    ]:
+        torch.testing.assert_close(ours, theirs)
 
 
 def test_frozen_table_keeps_the_players_as_they_were():

@@ -1,0 +1,204 @@
+"""The arms of the cued maze, and their rows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Annotated, Any
+
+import numpy as np
+import pandas as pd
+import torch
+
+from experiments.cue.theory import PENALTIES, Cues, text
+from experiments.experiment import Experiment
+from experiments.rows import tidy
+from ipo.checks import Positive, checked, one_of
+from ipo.networks import DenseOnTable, Weights
+from ipo.ppo import PPOSettings, Training
+from ipo.rollouts import Rollout
+from ipo.worlds.cued_maze import Cue, cued_maze
+from ipo.worlds.tabular import TabularDomains, expected_return
+
+ENCODINGS = ("signs", "one_hot")
+EXTREMES = (-1.0, 1.0)  # cues between which every return is linear
+METHODS = ("ppo", "in_turn", "ensemble", "ipo")
+
+
+@checked
+@dataclass(frozen=True)
+class Cell:
+    """One method at one point of a phase diagram.
+
+    Attributes:
+        settings: how it is trained.
+        cues: of the training domains.
+        encoding: what the network sees: landmark, cue and whether it is at the junction as numbers
+            (``signs``), or which of the eight observations it is (``one_hot``).
+        penalty: of V-REx; ``None``: there is none.
+    """
+
+    settings: PPOSettings
+    cues: Annotated[tuple[Cue, ...], "domains"]
+    encoding: Annotated[str, one_of(ENCODINGS)] = "signs"
+    penalty: Positive | None = None
+
+    def __post_init__(self) -> None:
+        if self.penalty is not None and self.settings.method != "ppo":
+            raise ValueError(f"penalty = {self.penalty}: must be None, but for the method ppo")
+
+    @property
+    def columns(self) -> dict[str, Any]:
+        method = self.settings.method if self.penalty is None else f"vrex_{self.penalty:g}"
+        return {"method": method, "cues": text(self.cues), "encoding": self.encoding}
+
+
+class Waiting(Cell):
+    """A cell by how many gradient steps a player makes before the others answer."""
+
+    @property
+    def columns(self) -> dict[str, Any]:
+        return super().columns | {"steps": self.settings.num_epochs}
+
+
+def one_step(method: str, num_updates: int) -> PPOSettings:
+    """A player makes one gradient step on each rollout, as the theory has it."""
+    return PPOSettings(
+        method,
+        learning_rate=2e-2,
+        num_updates=num_updates,
+        num_envs=144,  # a multiple of 2^2, 3^2 and 4^2, for the players of an ensemble
+        num_steps=4,
+        num_epochs=1,
+        num_minibatches=1,
+        discount=0.9,  # it pays to hurry: with 0.99, some runs learn to choose and not to walk
+    )
+
+
+def many_steps(method: str, num_updates: int) -> PPOSettings:
+    """A player learns from each rollout in four epochs of four minibatches, as PPO usually does."""
+    return PPOSettings(
+        method,
+        learning_rate=1e-2,
+        num_updates=num_updates,
+        num_envs=144,
+        num_steps=8,
+        num_minibatches=4,
+    )
+
+
+def phase_cells(points: Sequence[Cues], num_updates: int) -> list[Cell]:
+    """Every arm at every point of a diagram."""
+    ppo = one_step("ppo", num_updates)
+    return [
+        cell
+        for cues in points
+        for cell in (
+            *(Cell(one_step(method, num_updates), cues) for method in METHODS),
+            *(Cell(ppo, cues, penalty=float(p)) for p in PENALTIES),
+        )
+    ]
+
+
+def encoding_cells(points: Sequence[Cues], num_updates: int) -> list[Cell]:
+    """PPO and IPO where observations have no signs in common."""
+    return [
+        Cell(one_step(method, num_updates), cues, "one_hot")
+        for cues in points
+        for method in ("ppo", "ipo")
+    ]
+
+
+def many_step_cells(points: Sequence[Cues], num_updates: int) -> list[Cell]:
+    """PPO and IPO with many steps on each rollout."""
+    return [
+        Cell(many_steps(method, num_updates), cues) for cues in points for method in ("ppo", "ipo")
+    ]
+
+
+def waiting_cells(cues: Cues, steps: Sequence[int], num_updates: int) -> list[Waiting]:
+    """PPO and IPO at one point, with as many gradient steps in all, on fewer and fewer rollouts."""
+    return [
+        Waiting(replace(one_step(method, max(1, num_updates // num)), num_epochs=num), cues)
+        for num in steps
+        for method in ("ppo", "ipo")
+    ]
+
+
+class VREx(Training):
+    """PPO on the mean return of the domains minus a penalty times its variance::
+
+        J = mean_d R_d - penalty Var_d R_d,
+        grad J = mean_d [1 - 2 penalty (R_d - mean R)] grad R_d
+
+    So each domain's advantages get a weight. R_d is estimated by the mean of the returns in its
+    part of the rollout. Source: Krueger et al. (2021), with returns in place of risks.
+    """
+
+    def __init__(self, penalty: float, *given: Any) -> None:
+        super().__init__(*given)
+        self.penalty, self.num_domains = penalty, len(self.moves[0].domains)
+
+    def weighted(self, rollout: Rollout) -> Rollout:
+        """Of ``[R, N, T]``, whose copies are in the order of their domains, evenly many of each."""
+        by_domain = rollout.returns.unflatten(1, (self.num_domains, -1))
+        returns = by_domain.mean((2, 3), keepdim=True)  # [R, E, 1, 1]
+        weights = 1 - 2 * self.penalty * (returns - returns.mean(1, keepdim=True))
+        advantages = rollout.advantages.view_as(by_domain) * weights
+        return rollout._replace(advantages=advantages.flatten(1, 2))
+
+    def respond(self, d: int) -> None:
+        """PPO's only move, with these weights."""
+        average = self.network.frozen(self.players)
+        rollout = self.collectors[d].collect(average, self.network.distribution, self.draws)
+        self.num_frames += rollout.values[0].numel()
+        self.improve(self.moves[d].player, self.weighted(rollout).frames())
+
+
+def training(cell: Cell, seeds: list[int]) -> Training:
+    """Runs of a cell that have not begun."""
+    domains = TabularDomains([cued_maze(cue) for cue in cell.cues])
+    given = (network(cell.encoding), domains, len(cell.cues), cell.settings, seeds)
+    return Training(*given) if cell.penalty is None else VREx(cell.penalty, *given)
+
+
+def network(encoding: str) -> DenseOnTable:
+    """A player's, with 16 tanh units. All domains have the same eight observations."""
+    images = torch.tensor(TabularDomains([cued_maze(0.0)]).images).float()
+    table = images if encoding == "signs" else torch.eye(len(images))
+    return DenseOnTable(table, num_actions=3, hidden=(16,))
+
+
+def run_cell(cell: Cell, seeds: list[int]) -> pd.DataFrame:
+    """Train, and give the exact returns where the cue is always wrong and where it is right."""
+    *_, (_, players) = training(cell, seeds).reports()
+    return tidy(cell, seeds, exact(network(cell.encoding), players))
+
+
+def exact(network: DenseOnTable, players: Sequence[Weights]) -> dict[tuple[str, str], np.ndarray]:
+    """Exact returns ``[R]`` of the average policy at both extremes of the cue."""
+    doubled = [{name: w.double() for name, w in player.items()} for player in players]
+    policy = network.average(doubled)[0].softmax(-1).numpy()
+    (seen,) = TabularDomains([cued_maze(0.0)]).observation_of
+    return {
+        (f"{cue:g}", "return_exact"): expected_return(cued_maze(cue), policy[:, seen])[0]
+        for cue in EXTREMES
+    }
+
+
+def short(cell: Cell) -> Cell | None:
+    """Two updates at one point of each diagram; the others are of no other kind."""
+    if sorted(set(cell.cues)) != [-0.9, 0.9]:
+        return None
+    return replace(cell, settings=replace(cell.settings, num_updates=2))
+
+
+def short_waiting(cell: Waiting) -> Waiting:
+    """One update."""
+    return replace(cell, settings=replace(cell.settings, num_updates=1))
+
+
+EXPERIMENTS = {
+    name: Experiment(run_cell, Cell, short)
+    for name in ("two_domains", "three_domains", "four_domains", "encodings", "many_steps")
+} | {"waiting": Experiment(run_cell, Waiting, short_waiting)}
