@@ -28,7 +28,7 @@ from ipo.checks import Count, Positive, checked, one_of
 FAMILIES = ("no_bias", "biases")
 NUM_DOMAINS = 2
 NUM_OBSERVATIONS = 6
-AT_REST = 1e-12  # gains that are rounding
+ROUNDING = 1e-12  # gains that are none
 SETTLED, OPTIMAL = 1e-9, 0.01  # gaps and costs, relative to those of doing nothing
 NAMES = {"no_bias": "no biases", "biases": "biases"}
 
@@ -72,7 +72,7 @@ class Problem(NamedTuple):
 
     Attributes:
         shares: of the observations in each domain, ``[E, n]``.
-        networks: a basis ``[S, n, width (+ 1)]`` of each choice of units.
+        networks: a basis ``[S, n, B]`` of the outputs of each choice of units.
         wanted: ``[n]``.
     """
 
@@ -81,75 +81,83 @@ class Problem(NamedTuple):
     wanted: np.ndarray
 
 
-def problem(cell: Cell, rng: np.random.Generator) -> Problem:
+def problem(family: str, width: int, rng: np.random.Generator) -> Problem:
     """Random observations, shares and a wanted policy with one unit."""
-    if cell.family == "no_bias":
+    if family == "no_bias":
         x, constant = np.array([-1.0, 1.0]), np.zeros((2, 0))
         units = relu(np.stack([x, -x], 1))
     else:
         x = np.sort(rng.uniform(-1, 1, NUM_OBSERVATIONS))
         constant = np.ones((NUM_OBSERVATIONS, 1))
         units = np.concatenate([relu(x[:, None] - x[:-1]), relu(x[1:] - x[:, None])], 1)
-    chosen = np.array(list(itertools.combinations(range(units.shape[1]), cell.width)))
-    networks = np.stack([np.concatenate([constant, units[:, own]], 1) for own in chosen])
+    choices = itertools.combinations(range(units.shape[1]), width)
+    networks = [np.concatenate([constant, units[:, own]], 1) for own in choices]
     one = np.concatenate([constant, units[:, [rng.integers(units.shape[1])]]], 1)
     shares = rng.dirichlet(np.ones(len(x)), NUM_DOMAINS)
-    return Problem(shares, networks, one @ rng.standard_normal(one.shape[1]))
+    return Problem(shares, np.stack(networks), one @ rng.standard_normal(one.shape[1]))
 
 
 def relu(x: np.ndarray) -> np.ndarray:
     return np.maximum(x, 0)
 
 
-def play(cell: Cell, rng: np.random.Generator) -> dict[str, float]:
-    """Best responses in turn, from random networks, until nobody gains or the rounds are over.
+class Game:
+    """Players whose outputs ``[E, n]`` are those of networks; each pays for the average's errors.
 
-    Returns:
-        ``gap``, the Nash gap, and ``cost``, that of the average in the domain where it is highest;
-        both relative to the cost of zero there.
+    J_d = sum_o shares_d(o) (average(o) - wanted(o))^2
     """
-    own = problem(cell, rng)
-    maps = projections(own)
-    networks = own.networks[rng.integers(len(own.networks), size=NUM_DOMAINS)]
-    weights = cell.scale * rng.standard_normal((NUM_DOMAINS, networks.shape[-1]))
-    players = (networks @ weights[..., None])[..., 0]  # [E, n]
 
-    def gain_of(d: int) -> tuple[float, np.ndarray]:
-        """How much player d can gain, and by which outputs."""
-        target = NUM_DOMAINS * own.wanted - (players.sum(0) - players[d])
-        each = maps[d] @ target  # [S, n]
-        costs = (each - target) ** 2 @ own.shares[d] / NUM_DOMAINS**2
-        return cost_of(d) - costs.min(), each[costs.argmin()]
+    def __init__(self, own: Problem, players: np.ndarray) -> None:
+        self.shares, self.wanted, self.players = own.shares, own.wanted, players.copy()
+        # The nearest outputs of each choice of units in each domain, as maps [E, S, n, n].
+        roots = np.sqrt(own.shares)[:, None]  # [E, 1, n]
+        inverses = np.linalg.pinv(roots[..., None] * own.networks)
+        self.nearest = own.networks @ inverses * roots[..., None, :]
 
-    def cost_of(d: int) -> float:
-        return (players.mean(0) - own.wanted) ** 2 @ own.shares[d]
+    def cost(self, d: int) -> float:
+        return float((self.players.mean(0) - self.wanted) ** 2 @ self.shares[d])
 
-    for _ in range(cell.num_rounds):
-        rests = True
-        for d in range(NUM_DOMAINS):
-            gain, response = gain_of(d)
-            if gain > AT_REST:
-                players[d], rests = response, False
-        if rests:
-            break
-    zero = own.wanted**2 @ own.shares.T
-    return {
-        "gap": max(gain_of(d)[0] / zero[d] for d in range(NUM_DOMAINS)),
-        "cost": max(cost_of(d) / zero[d] for d in range(NUM_DOMAINS)),
-    }
+    def response(self, d: int) -> tuple[float, np.ndarray]:
+        """How much player d can gain alone, and the outputs ``[n]`` by which it does."""
+        num_players = len(self.players)
+        target = num_players * self.wanted - (self.players.sum(0) - self.players[d])
+        each = self.nearest[d] @ target  # [S, n]
+        costs = (each - target) ** 2 @ self.shares[d] / num_players**2
+        return self.cost(d) - costs.min(), each[costs.argmin()]
 
-
-def projections(own: Problem) -> np.ndarray:
-    """The nearest outputs of each choice of units in each domain, as maps ``[E, S, n, n]``."""
-    roots = np.sqrt(own.shares)[:, None]  # [E, 1, n]
-    return own.networks @ np.linalg.pinv(roots[..., None] * own.networks) * roots[..., None, :]
+    def play(self, num_rounds: int) -> None:
+        """Best responses in turn, until nobody gains."""
+        for _ in range(num_rounds):
+            at_rest = True
+            for d in range(len(self.players)):
+                gain, response = self.response(d)
+                if gain > ROUNDING:
+                    self.players[d], at_rest = response, False
+            if at_rest:
+                return
 
 
 def run_relu(cell: Cell, seeds: list[int]) -> pd.DataFrame:
-    """A random game for each seed."""
-    played = [play(cell, np.random.default_rng(seed)) for seed in seeds]
-    metrics = {("train", name): [own[name] for own in played] for name in played[0]}
-    return tidy(cell, seeds, metrics)
+    """A random game for each seed.
+
+    ``gap`` is the Nash gap, ``cost`` that of the average where it is highest; both relative to what
+    outputs of zero cost in the domain.
+    """
+    values = np.array([_end(cell, np.random.default_rng(seed)) for seed in seeds])
+    return tidy(
+        cell, seeds, dict(zip([("train", "gap"), ("train", "cost")], values.T, strict=True))
+    )
+
+
+def _end(cell: Cell, rng: np.random.Generator) -> tuple[float, float]:
+    own = problem(cell.family, cell.width, rng)
+    networks = own.networks[rng.integers(len(own.networks), size=NUM_DOMAINS)]
+    weights = cell.scale * rng.standard_normal((NUM_DOMAINS, networks.shape[-1]))
+    game = Game(own, (networks @ weights[..., None])[..., 0])
+    game.play(cell.num_rounds)
+    zero = own.shares @ own.wanted**2
+    gaps = [game.response(d)[0] / zero[d] for d in range(NUM_DOMAINS)]
+    return max(gaps), max(game.cost(d) / zero[d] for d in range(NUM_DOMAINS))
 
 
 def ends(rows: pd.DataFrame) -> pd.DataFrame:
