@@ -1,4 +1,4 @@
-"""The game between ReLU networks: best responses against a slow search, and a stuck pair by hand."""
+"""The game between ReLU networks: best responses beside a slow search, a stuck pair by hand."""
 
 import itertools
 
