@@ -13,6 +13,9 @@ import nbformat
 import benchmarks
 import claims
 import costs
+import deviations
+import fairness
+import hyperparameters
 import licences
 import provenance
 import reliability
@@ -57,6 +60,9 @@ def stage(root: Path, source: Path, notebooks: list[Notebook], profile: str) -> 
     benchmarks.write_fragment(source)
     costs.write_fragment(source)
     licences.write_fragment(source)
+    fairness.write_fragment(source)
+    hyperparameters.write_fragment(source)
+    deviations.write_fragment(source)
     run_times = source / "_generated" / "run_times.md"
     run_times.write_text(run_times_tables(notebooks, profile), encoding="utf-8")
 

@@ -341,7 +341,11 @@ def test_every_claim_names_a_rule_and_its_settings(claim):
     assert parameters[2:] == list(claim["settings"])
     assert all(variant.keys() <= claim["settings"].keys() for variant in variants(claim))
     texts = {"id", "chapter", "title", "claim", "where", "test"}
-    assert claim.keys() - {"variants", "paper", "columns"} == texts | {"results", "rule", "settings"}
+    assert claim.keys() - {"variants", "paper", "columns"} == texts | {
+        "results",
+        "rule",
+        "settings",
+    }
 
 
 def variants(claim: dict) -> list[dict]:
