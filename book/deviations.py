@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import yaml
 
 from experiments.registry import DATA
 from fairness import row
-from measured import difference
+from measured import listed
 
 COLUMNS = {
     "what": "",
@@ -39,14 +37,5 @@ def tables() -> str:
 
 def effect(problem: dict, entry: dict) -> str:
     """In words, by what was measured, and where to read on."""
-    lines = [entry["effect"]] if "effect" in entry else []
-    for name, arms in entry.get("measured", {}).items():
-        lines.append(f"{name}: **{difference(problem, arms)}**")
-    return "<br>".join([*lines, f"{{ref}}`{entry['see']}`"])
-
-
-def write_fragment(folder: Path) -> None:
-    """Writes ``_generated/deviations.md`` under ``folder``."""
-    target = Path(folder) / "_generated"
-    target.mkdir(parents=True, exist_ok=True)
-    (target / "deviations.md").write_text(tables(), encoding="utf-8")
+    words = [entry["effect"]] if "effect" in entry else []
+    return "<br>".join([*words, *listed(problem, entry), f"{{ref}}`{entry['see']}`"])

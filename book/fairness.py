@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import yaml
 
 from experiments.registry import DATA
 from hyperparameters import NUM_DOMAINS, SETTINGS, envs_of, num_frames, num_gradient_steps
-from measured import difference
+from measured import listed
 
 NOT_MEASURED = "*not measured*"
 
@@ -44,9 +42,7 @@ def table() -> str:
 
 def cell(problem: dict, entry: dict, words: dict[str, object]) -> str:
     """What is unequal, then each difference that was measured."""
-    lines = [entry["unequal"].format(**words)]
-    for name, arms in entry.get("measured", {}).items():
-        lines.append(f"{name}: **{difference(problem, arms)}**")
+    lines = [entry["unequal"].format(**words), *listed(problem, entry)]
     if "why" in entry:
         lines.append(f"{NOT_MEASURED}: {entry['why']}")
     return "<br>".join(lines)
@@ -54,10 +50,3 @@ def cell(problem: dict, entry: dict, words: dict[str, object]) -> str:
 
 def row(cells: list[str]) -> str:
     return "| " + " | ".join(cells) + " |"
-
-
-def write_fragment(folder: Path) -> None:
-    """Writes ``_generated/fairness.md`` under ``folder``."""
-    target = Path(folder) / "_generated"
-    target.mkdir(parents=True, exist_ok=True)
-    (target / "fairness.md").write_text(table(), encoding="utf-8")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import pandas as pd
@@ -93,7 +92,7 @@ OURS: dict[str, Callable[[Any, int], Any]] = {
     "batch size": batch_sizes,
     "entropy bonus": lambda own, _: own.entropy_weight,
     "clip range": lambda own, _: own.clip,
-    "total time-steps": num_frames,
+    "total time-steps": lambda own, num_domains: f"{num_frames(own, num_domains):,}",
     "environments": lambda own, _: " + ".join(map(str, envs_of(own))),
     "Adam's ε": lambda own, _: own.adam_epsilon,
     "weight of the value loss": lambda own, _: own.value_weight,
@@ -128,10 +127,10 @@ def tables() -> str:
             columns[f"{NAMES[method]}, runs"] = pd.Series(
                 {s: f"**{now}**" if differs(texts[s], now) else now for s, now in here.items()}
             )
-        table = pd.DataFrame(columns).fillna("").rename_axis("Setting").reset_index()
-        text = table.to_markdown(index=False, disable_numparse=True)
+        table = pd.DataFrame(columns).reindex(rows["setting"].unique()).fillna("")
+        text = table.rename_axis("Setting").to_markdown(disable_numparse=True)
         parts.append(f"### {TITLES[problem]}\n\n{text}")
-    return "\n\n".join(parts)
+    return "\n\n".join(parts) + "\n"
 
 
 def differs(text: str, here: str) -> bool:
@@ -141,11 +140,4 @@ def differs(text: str, here: str) -> bool:
     if text[-1] not in ROUNDED:
         return True
     stated = float(text[:-1]) * ROUNDED[text[-1]]
-    return abs(float(here) - stated) > 0.05 * stated
-
-
-def write_fragment(folder: Path) -> None:
-    """Writes ``_generated/hyperparameters.md`` under ``folder``."""
-    target = Path(folder) / "_generated"
-    target.mkdir(parents=True, exist_ok=True)
-    (target / "hyperparameters.md").write_text(tables() + "\n", encoding="utf-8")
+    return abs(float(here.replace(",", "")) - stated) > 0.05 * stated

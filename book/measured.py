@@ -13,6 +13,7 @@ from rules.cells import Cells
 from rules.verdicts import compare
 
 FEWEST_RUNS = 10  # of an arm
+NO_BREAK = "\N{NO-BREAK SPACE}"
 
 
 def difference(problem: dict, arms: dict) -> str:
@@ -28,7 +29,14 @@ def difference(problem: dict, arms: dict) -> str:
     runs = ahead.index.intersection(behind.index)  # some arms have more
     sign, digits = problem["sign"] * problem["scale"], problem["digits"]
     mean, low, high, _ = compare(sign * ahead[runs], sign * behind[runs]).difference
-    return f"{mean:+.{digits}f} [{low:+.{digits}f}, {high:+.{digits}f}]".replace("-", "−")
+    text = f"{mean:+.{digits}f} [{low:+.{digits}f}, {high:+.{digits}f}]".replace("-", "−")
+    return text.replace(" ", NO_BREAK)
+
+
+def listed(problem: dict, entry: dict) -> list[str]:
+    """Every difference of an entry, a line each."""
+    measured = entry.get("measured", {})
+    return [f"→ {name}: **{difference(problem, arms)}**" for name, arms in measured.items()]
 
 
 def values(problem: dict, arms: dict, arm: dict) -> pd.Series:

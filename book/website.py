@@ -60,11 +60,14 @@ def stage(root: Path, source: Path, notebooks: list[Notebook], profile: str) -> 
     benchmarks.write_fragment(source)
     costs.write_fragment(source)
     licences.write_fragment(source)
-    fairness.write_fragment(source)
-    hyperparameters.write_fragment(source)
-    deviations.write_fragment(source)
-    run_times = source / "_generated" / "run_times.md"
-    run_times.write_text(run_times_tables(notebooks, profile), encoding="utf-8")
+    fragments = {
+        "fairness": fairness.table(),
+        "hyperparameters": hyperparameters.tables(),
+        "deviations": deviations.tables(),
+        "run_times": run_times_tables(notebooks, profile),
+    }
+    for name, text in fragments.items():
+        (source / "_generated" / f"{name}.md").write_text(text, encoding="utf-8")
 
 
 def run_jupyter_book(source: Path, output: Path) -> Path:

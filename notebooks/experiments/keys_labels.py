@@ -205,4 +205,4 @@ def short(cell: Cell) -> Cell:
     return replace(cell, trained=keys.short(cell.trained))
 
 
-EXPERIMENT = Experiment(run_labels, Cell, short, runs_at_once=25)
+EXPERIMENTS = {"labels": Experiment(run_labels, Cell, short, runs_at_once=25)}

@@ -15,7 +15,7 @@ from ipo.checks import check_choice
 DATA = ROOT / "data"
 CHAPTERS: dict[str, dict[str, Experiment]] = {
     "lqr": lqr.EXPERIMENTS,
-    "keys": keys.EXPERIMENTS | {"labels": keys_labels.EXPERIMENT},
+    "keys": keys.EXPERIMENTS | keys_labels.EXPERIMENTS,
     "causality": causality.EXPERIMENTS,
     "algorithm": algorithm.EXPERIMENTS,
     "door": door.EXPERIMENTS,

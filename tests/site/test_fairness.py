@@ -11,6 +11,7 @@ import deviations
 import fairness
 import measured
 from experiments.registry import DATA
+from measured import NO_BREAK
 from rules import NoData
 
 PAGE = yaml.safe_load((DATA / "fairness.yml").read_text("utf-8"))
@@ -38,10 +39,10 @@ ARMS = {"results": ["toy/rows"], "of": {"method": "b"}, "against": {"method": "a
 def test_a_difference_by_hand(by_hand):
     """b costs 2 - 0.1 run less: 1.55 on average, t of 9 degrees of freedom is 2.262."""
     half = 2.262157 * np.std(0.1 * np.arange(10), ddof=1) / np.sqrt(10)
-    expected = f"+15.5 [+{10 * (1.55 - half):.1f}, +{10 * (1.55 + half):.1f}]"
+    expected = f"+15.5{NO_BREAK}[+{10 * (1.55 - half):.1f},{NO_BREAK}+{10 * (1.55 + half):.1f}]"
     assert measured.difference(PROBLEM, ARMS) == expected
     turned = measured.difference(PROBLEM | {"sign": 1}, ARMS)
-    assert turned.startswith("−15.5 [−")
+    assert turned.startswith(f"−15.5{NO_BREAK}[−")
 
 
 def test_an_arm_without_rows_has_no_difference(by_hand):
@@ -75,11 +76,14 @@ def test_pages_have_every_difference_and_name_what_is_not_measured():
 def interval(problem: str, aspect: str, name: str) -> tuple[float, float]:
     (entry,) = (own[problem] for own in PAGE["aspects"] if own["aspect"] == aspect)
     text = measured.difference(PAGE["problems"][problem], entry["measured"][name])
-    low, high = text.replace("−", "-").partition("[")[2].rstrip("]").split(", ")
+    low, high = text.replace("−", "-").partition("[")[2].rstrip("]").split(f",{NO_BREAK}")
     return float(low), float(high)
 
 
 def test_the_sentences_on_linear_control():
+    for aspect in ("Learning rate", "Gradient steps", "Ensembling", "Network size"):
+        (entry,) = (own["lqr"] for own in PAGE["aspects"] if own["aspect"] == aspect)
+        assert all(interval("lqr", aspect, name)[0] > 0 for name in entry["measured"])
     low, high = interval("lqr", "Optimiser", "plain steps in both")
     assert -0.1 < low <= high < 0.1
     published, _ = interval("lqr", "As published", "as published")

@@ -29,9 +29,9 @@ def test_every_method_of_the_tables_is_there():
         ("256", "256", False),
         ("256", "512", True),
         ("", "5000", False),
-        ("120K", "122880", False),
-        ("25M", "24903680", False),
-        ("25M", "12451840", True),
+        ("120K", "122,880", False),
+        ("25M", "24,903,680", False),
+        ("25M", "12,451,840", True),
     ],
 )
 def test_what_differs_from_the_text(text, here, expected):
