@@ -259,13 +259,6 @@ def values(task: TabularTask, policy: Policies) -> tuple[np.ndarray, np.ndarray]
     return returns, success
 
 
-def starting_in(task: TabularTask, states: Sequence[int]) -> TabularTask:
-    """The same task, where episodes begin in these states alone, in proportion to before."""
-    start = np.zeros_like(task.start)
-    start[states] = task.start[states]
-    return replace(task, start=start / start.sum())
-
-
 @checked
 def reach(task: TabularTask, policy: Policies, states: Annotated[np.ndarray, "S"]) -> np.ndarray:
     """Probability ``[P]`` that policies ``[P, K, A]`` ever come to one of ``states [S]``.

@@ -35,7 +35,6 @@ from ipo.worlds.tabular import (
     TabularEnvironments,
     TabularTask,
     occupancy,
-    starting_in,
     values,
 )
 
@@ -74,7 +73,8 @@ def inferred(task: Keys, pooled: TabularTask, cell: keys.Cell, seeds: Sequence[i
     Of all halves it is largest where the g_c are apart at their median. (Of all pairs of domains,
     it is largest where one of them has a single environment.)
     """
-    ppo = keys.published("ppo", num_updates=cell.settings.num_updates)
+    learning_rate = keys.published("ppo").learning_rate
+    ppo = replace(cell.settings, method="ppo", learning_rate=learning_rate)
     *_, (_, players) = task.train(replace(cell, settings=ppo), list(seeds))
     slopes = slopes_in_scale(task, pooled, players)
     order = slopes.argsort(axis=1, kind="stable").argsort(axis=1)
@@ -163,6 +163,13 @@ def joined(tasks: Sequence[TabularTask]) -> TabularTask:
             for name in ("goal", "done", "images", "progress", "position", "signature")
         },
     )
+
+
+def starting_in(task: TabularTask, states: Sequence[int] | np.ndarray) -> TabularTask:
+    """The same task, where episodes begin in these states alone, in proportion to before."""
+    start = np.zeros_like(task.start)
+    start[states] = task.start[states]
+    return replace(task, start=start / start.sum())
 
 
 def environments(task: TabularTask) -> np.ndarray:
