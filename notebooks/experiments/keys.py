@@ -201,6 +201,19 @@ def setting_names(train_colors: Sequence[str]) -> dict[str, str]:
     }
 
 
+def fair_names(train_colors: Sequence[str]) -> dict[str, str]:
+    """Names of the arms with a larger network and with unequal shares, by label."""
+    most = f"three quarters in {train_colors[0]}"
+    return {
+        "ppo": "PPO, as published",
+        "ppo_wide": "PPO, as many weights as IPO",
+        "ppo_wide_lr5e-4": "PPO, as many weights, IPO's learning rate",
+        "ppo_75_25": f"PPO, {most}",
+        "ipo": "IPO, as published",
+        "ipo_75_25": f"IPO, {most}",
+    }
+
+
 def in_words(colors: Sequence[str]) -> str:
     """Such as "red, green and blue"."""
     return f"{', '.join(colors[:-1])} and {colors[-1]}"

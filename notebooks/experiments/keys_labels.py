@@ -25,8 +25,9 @@ from sklearn.cluster import KMeans
 
 from experiments import keys
 from experiments.experiment import Experiment
-from experiments.keys import Keys, evaluate
+from experiments.keys import TESTED, Keys, evaluate, gap, runs_of
 from experiments.rows import tidy
+from experiments.tables import mean_and_std
 from ipo.checks import checked, one_of
 from ipo.distributions import Generators
 from ipo.networks import Weights
@@ -205,6 +206,22 @@ class LabelledDomains:
         first = NUM_LABELS * np.arange(self.num_runs)[:, None]
         chosen = first + np.repeat(domains, num_copies)  # [R, N]
         return TabularEnvironments(self.table, chosen, generators)
+
+
+def table(rows: pd.DataFrame) -> pd.DataFrame:
+    """By method: what its labels are, its return on grey, and its difference to given labels."""
+    means = rows.groupby(["method", "metric"])["value"].mean().unstack()
+    # Given labels are the colours themselves; an ensemble has none.
+    means.loc["ipo", ["agreement", "smaller_domain"]] = 1, 0.5
+    return pd.DataFrame(
+        {
+            "arm": NAMES,
+            "agreement": means["agreement"],
+            "smaller domain": means["smaller_domain"],
+            "return on grey": {m: mean_and_std(runs_of(rows, m, TESTED), 3) for m in NAMES},
+            "− given labels": {m: gap(rows, m, "ipo") for m in NAMES if m != "ipo"},
+        }
+    ).loc[list(NAMES)]
 
 
 def short(cell: Cell) -> Cell:
