@@ -87,7 +87,8 @@ def read_claims(data: Path = DATA) -> dict:
 def decide(claim: dict, book: dict, results: dict[str, pd.DataFrame], data: Path = DATA) -> Finding:
     """The verdict on one claim, and what it would be with other settings of its rule."""
     chapter = book["chapters"][claim["chapter"]]
-    cells = cells_of(claim["results"], chapter, results)
+    columns = claim.get("columns", chapter["columns"])
+    cells = cells_of(claim["results"], chapter | {"columns": columns}, results)
     paper = load_paper(claim.get("paper", chapter.get("paper")), data)
 
     def ruled(**changes: object) -> Finding:

@@ -13,6 +13,9 @@ import nbformat
 import benchmarks
 import claims
 import costs
+import deviations
+import fairness
+import hyperparameters
 import licences
 import provenance
 import reliability
@@ -62,7 +65,14 @@ def stage(root: Path, source: Path, notebooks: list[Notebook], profile: str) -> 
     claims.write_fragments(source)
     for name, page in GENERATED.items():
         write_fragment(source, name, page.overview())
-    write_fragment(source, "run_times", run_times_tables(notebooks, profile))
+    tables = {
+        "fairness": fairness.table(),
+        "hyperparameters": hyperparameters.tables(),
+        "deviations": deviations.tables(),
+        "run_times": run_times_tables(notebooks, profile),
+    }
+    for name, text in tables.items():
+        write_fragment(source, name, text)
 
 
 def run_jupyter_book(source: Path, output: Path) -> Path:

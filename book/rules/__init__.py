@@ -52,6 +52,6 @@ RULES = {
         background.game_beside,
         background.game_varies_less,
         background.equilibria_are_invariant,
-        background.not_tested,
+        background.relu_equilibria,
     )
 }

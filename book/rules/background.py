@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 
+from experiments.games.relu import NAMES, ends
 from experiments.tables import chosen_by
 from rules.cells import Cells, NoData, label
 from rules.keys import narrower
@@ -122,6 +123,24 @@ def optimum(cells: Cells, beta: str) -> dict[str, float]:
     return {gain: cells.runs(metric=gain, **where).mean() for gain in ("k_1", "k_2")}
 
 
-def not_tested(cells: Cells, paper: pd.DataFrame, lacking: str) -> Finding:
-    """A claim that no experiment of the book decides."""
-    raise NoData(lacking)
+def relu_equilibria(cells: Cells, paper: pd.DataFrame, scales: list[float]) -> Finding:
+    """At every equilibrium of ReLU networks that was found the average is optimal in all domains.
+
+    ``scales`` are the starts that count. Which games are at an equilibrium, and which averages are
+    optimal, is for :func:`experiments.games.relu.ends`.
+    """
+    rows = cells.rows[cells.rows["scale"].isin(scales)]
+    if rows.empty:
+        raise NoData("equilibria of ReLU networks: 0")
+    verdicts, parts = [], []
+    for (units, width), own in ends(rows).groupby(["method", "width"], observed=True):
+        rest = own[own["rest"]]
+        wrong = int((~rest["optimal"]).sum())
+        verdicts.append(holds(wrong == 0))
+        hidden = "1 unit" if width == 1 else f"{width} units"
+        parts.append(f"{hidden}, {NAMES[units]}: {wrong} of {len(rest)}")
+    evidence = (
+        "equilibria whose average is not optimal in all training domains, by architecture: "
+        + "; ".join(parts)
+    )
+    return Finding(together(verdicts), evidence)

@@ -66,6 +66,7 @@ SMALLEST = {
         "num_rounds": 1,
         "num_updates": 1,
         "num_key_runs": 2,
+        "num_games": 1,
         "num_live": 1,
     },
     "your_own_domains": {
@@ -134,6 +135,7 @@ TOGETHER: dict[str, list[dict[str, Any]]] = {
         {"num_problems": 2, "num_live": 3},
         {"num_problems": 501, "num_live": 4, "num_rounds": 1},
         {"num_updates": 3, "num_key_runs": 3, "num_rounds": 1},
+        {"num_games": 4, "num_rounds": 1},
     ],
     "your_own_domains": [
         SMALLEST["your_own_domains"],

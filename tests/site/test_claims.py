@@ -350,7 +350,11 @@ def test_every_claim_names_a_rule_and_its_settings(claim):
     assert parameters[2:] == list(claim["settings"])
     assert all(variant.keys() <= claim["settings"].keys() for variant in variants(claim))
     texts = {"id", "chapter", "title", "claim", "where", "test"}
-    assert claim.keys() - {"variants", "paper"} == texts | {"results", "rule", "settings"}
+    assert claim.keys() - {"variants", "paper", "columns"} == texts | {
+        "results",
+        "rule",
+        "settings",
+    }
 
 
 def variants(claim: dict) -> list[dict]:
@@ -547,3 +551,27 @@ def test_the_outside_serves_or_not(empty, opened, spread, expected):
         success={(*arm, 0.1): (opened, spread) for arm in arms},
     )
     assert verdict(empty, "door-outside-viable") == expected
+
+
+@pytest.mark.parametrize(
+    ("cost", "expected"),
+    [
+        ([0.0, 0.0], claims.REPRODUCED),
+        ([0.0, 0.5], claims.IN_PART),
+        ([0.5, 0.5], claims.CONTRADICTED),
+    ],
+)
+def test_equilibria_of_relu_networks(empty, cost, expected):
+    """Of two architectures; games that are not at rest say nothing."""
+    ends = [(width, run, 0.0, own) for width, own in enumerate(cost, 1) for run in range(2)]
+    ends.append((1, 2, 0.1, 0.9))
+    lines = [
+        ("no_bias", width, 1.0, run, "train", metric, value)
+        for width, run, gap, own in ends
+        for metric, value in (("gap", gap), ("cost", own))
+    ]
+    columns = ["method", "width", "scale", "run", "domain", "metric", "value"]
+    store_rows(empty, "algorithm/relu", pd.DataFrame(lines, columns=columns))
+    found = finding(empty, "algorithm-relu")
+    assert found.verdict == expected
+    assert found.variants["starts ten times as large"].verdict == claims.NO_DATA

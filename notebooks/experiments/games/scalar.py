@@ -14,7 +14,7 @@ from torch import Tensor
 from experiments.experiment import Experiment
 from experiments.figures import OUTCOMES
 from experiments.games import played as games_played
-from experiments.games import players
+from experiments.games import players, relu
 from experiments.games.scalar_control import costs, stationary_cost, unseen_cost
 from experiments.origin import ROOT
 from experiments.rows import tidy
@@ -300,6 +300,6 @@ EXPERIMENTS = (
         name: Experiment(run_cell, Cell, short, (0, 1, 200))
         for name in ("grid", "random", "ablation")
     }
-    | {"players": players.EXPERIMENT}
+    | {"players": players.EXPERIMENT, "relu": relu.EXPERIMENT}
     | games_played.EXPERIMENTS
 )
