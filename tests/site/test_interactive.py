@@ -1,0 +1,207 @@
+"""Interactive figures: their numbers are those of the rows, and keys, phones and no scripts do."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import pytest
+import torch
+from browse import PHONE, WIDE, new_context
+
+from experiments.interactive import lqr, page
+from experiments.store import Store, select
+from ipo.causality.small_games import vote
+from ipo.lqr import oracle_cost
+
+ROOT = Path(__file__).resolve().parents[2]
+FIGURES = {"algorithm": "regression-game", "lqr": "lqr-explorer"}  # by page
+
+
+def rows(chapter: str, name: str):
+    """Shipped rows."""
+    return Store(ROOT / "data" / "results" / chapter, name).rows()
+
+
+@pytest.fixture
+def shown(browser, tmp_path):
+    """Opens a page with nothing but a figure; in the end, nothing has been complained of."""
+    complaints = []
+    with new_context(browser, PHONE) as context:
+
+        def show(name: str, data: dict):
+            shutil.copytree(ROOT / "book" / "extra", tmp_path, dirs_exist_ok=True)
+            made = page.figure(name, data, plt.figure(), "first").data
+            (tmp_path / "page.html").write_text(f'<!doctype html><meta charset="utf-8">{made}')
+            opened = context.new_page()
+            opened.on("pageerror", lambda error: complaints.append(str(error)))
+            opened.on("console", lambda message: complaints.append(message.text))
+            opened.goto((tmp_path / "page.html").as_uri())
+            return opened
+
+        yield show
+    assert complaints == []
+
+
+def outcome(opened) -> str:
+    return opened.locator(".interactive output").inner_text().replace("−", "-")
+
+
+# ------------------------------------------------------------------------- on the pages of the site
+
+
+@pytest.fixture(params=FIGURES)
+def name(request) -> str:
+    return request.param
+
+
+@pytest.fixture(params=[WIDE, PHONE], ids=["wide", "phone"])
+def on_the_site(request, browser, built_site, name):
+    with new_context(browser, request.param) as context:
+        opened = context.new_page()
+        opened.goto(f"{built_site.as_uri()}/{name}.html")
+        yield opened
+
+
+def test_every_control_is_reached_by_keys_and_every_picture_fits(on_the_site, name):
+    home = on_the_site.locator(f"#{FIGURES[name]}")
+    on_the_site.evaluate(
+        "home => home.querySelector('input, select, button').focus()", home.element_handle()
+    )
+    controls = home.locator("input:enabled, select:enabled, button:enabled")
+    for number in range(controls.count()):
+        is_focused = "control => control === document.activeElement"
+        assert controls.nth(number).evaluate(is_focused), number
+        style = controls.nth(number).evaluate("control => getComputedStyle(control).outlineStyle")
+        assert style != "none"
+        on_the_site.keyboard.press("Tab")
+    right = on_the_site.evaluate("document.documentElement.clientWidth")
+    for picture in home.locator("svg").all():
+        box = picture.bounding_box()
+        assert box["width"] > 0
+        assert 0 <= box["x"] <= box["x"] + box["width"] <= right
+
+
+def test_every_control_and_picture_has_a_name(on_the_site, name):
+    home = on_the_site.locator(f"#{FIGURES[name]}")
+    for control in home.locator("input, select").all():
+        assert control.evaluate("control => control.labels[0].innerText").strip()
+    for picture in home.locator("svg[role=img]").all():
+        assert picture.get_attribute("aria-label")
+    assert home.locator("output[aria-live=polite]").count() == 1
+
+
+def test_without_scripts_there_is_a_picture(browser, built_site, name):
+    with browser.new_context(java_script_enabled=False) as context:
+        opened = context.new_page()
+        opened.goto(f"{built_site.as_uri()}/{name}.html")
+        picture = opened.locator(f"#{FIGURES[name]} img")
+        assert picture.is_visible()
+        assert len(picture.get_attribute("alt").split()) > 5
+
+
+def test_data_are_small(built_site, name):
+    text = (built_site / f"{name}.html").read_text("utf-8")
+    (data,) = re.findall(r'<script type="application/json">(.*?)</script>', text, re.DOTALL)
+    assert len(data) <= 300_000
+    json.loads(data)
+
+
+def test_data_cannot_end_their_element():
+    made = page.figure("any", {"text": "</script>"}, plt.figure(), '"quoted"').data
+    assert made.count("</script>") == 3  # of the data, and two that are loaded
+    assert "&quot;quoted&quot;" in made
+
+
+def test_data_that_are_not_finite_are_refused():
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        page.figure("any", {"cost": float("inf")}, plt.figure(), "")
+
+
+# ------------------------------------------------------------------------------- the two players
+
+
+@pytest.mark.parametrize("wishes", [(0.8, -0.4), (0.9, 0.5), (-0.3, -0.7)])
+@pytest.mark.parametrize("bound", [0.1, 0.5, 2.0])
+def test_bounded_players_end_where_the_theorem_says(shown, wishes, bound):
+    said = outcome(shown("regression-game", {"wishes": wishes, "bound": bound}))
+    elected = float(vote(torch.tensor(wishes).double()[:, None], bound=bound))
+    assert f"their average at {elected:.2f}" in said.replace("-0.00", "0.00")
+    assert f"The theorem says {elected:.2f}" in said
+
+
+def test_sliders_are_moved_by_keys(shown):
+    opened = shown("regression-game", {"wishes": (0.8, -0.4), "bound": 2.0})
+    sliders = opened.locator("input[type=range]")
+    sliders.nth(1).focus()
+    for _ in range(20):  # from -0.4 to 0.6: the same sign now
+        opened.keyboard.press("ArrowRight")
+    assert sliders.nth(1).get_attribute("aria-valuetext") == "0.60"
+    assert "their average at 0.60" in outcome(opened)
+    opened.locator("input[type=checkbox]").focus()
+    opened.keyboard.press("Space")
+    assert "there is no equilibrium" in outcome(opened)
+    assert sliders.nth(2).is_disabled()
+
+
+# -------------------------------------------------------------------------------------------- LQR
+
+
+@pytest.fixture(scope="module")
+def lqr_tables():
+    return [rows("lqr", n) for n in ("tables", "more_domains", "optimizers", "closed_form")]
+
+
+@pytest.fixture(scope="module")
+def lqr_data(lqr_tables):
+    return lqr.costs_and_gains(lqr_tables, {"num_domains": 5, "dim_distractor": 1000})
+
+
+def value(table, metric: str, **cell) -> float:
+    return select(table, {"metric": metric, **cell})["value"].mean()
+
+
+@pytest.mark.parametrize(
+    ("table", "optimizer", "method", "num_domains", "dim_distractor"),
+    [
+        (0, "adam", "gradient_descent", 5, 1000),
+        (0, "adam", "ipo_variable_phi", 2, 1000),
+        (0, "adam", "overparameterized", 5, 100),
+        (1, "adam", "ipo_fixed_phi", 50, 1000),
+        (2, "plain", "ipo_fixed_phi", 10, 1000),
+        (2, "lbfgs", "gradient_descent", 5, 1000),
+    ],
+)
+def test_costs_and_gains_are_those_of_the_rows(
+    shown, lqr_tables, lqr_data, table, optimizer, method, num_domains, dim_distractor
+):
+    opened = shown("lqr-explorer", lqr_data)
+    chosen = {
+        "num_domains": num_domains,
+        "dim_distractor": dim_distractor,
+        "method": method,
+        "optimizer": optimizer,
+    }
+    for select_, option in zip(opened.locator("select").all(), chosen.values(), strict=True):
+        select_.select_option(str(option))
+    said = outcome(opened)
+    found = {m: value(lqr_tables[table], m, **chosen) for m in ("test_cost", *lqr.MEANS.values())}
+    assert f"cost {found['test_cost']:.1f} ±" in said
+    assert f"{found['train_cost']:.1f} in the training domains" in said
+    assert f"the oracle {oracle_cost():.1f}" in said
+    assert f"{found['gain_norm_distractor']:.2f} looks at distractors" in said
+    assert f"{found['gain_norm_outside']:.2f} lies where" in said
+    assert opened.locator("g.chosen circle").count() == 10  # a point for each run
+
+
+def test_keys_choose_what_was_run_and_nothing_else(shown, lqr_data):
+    opened = shown("lqr-explorer", lqr_data)
+    opened.locator("select").nth(3).focus()
+    opened.keyboard.press("ArrowDown")
+    assert "gradient descent, plain" in outcome(opened)
+    wanted = {str(n) for n in (2, 5, 10)}
+    domains = opened.locator("select").first.locator("option:enabled").all_inner_texts()
+    assert set(domains) == wanted
