@@ -5,20 +5,29 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import matplotlib.pyplot as plt
+import numpy as np
 import pytest
 import torch
 from browse import PHONE, WIDE, new_context
 
+from experiments import keys
+from experiments.interactive import keys as keys_explorer
 from experiments.interactive import lqr, page
 from experiments.store import Store, select
 from ipo.causality.small_games import vote
 from ipo.lqr import oracle_cost
+from ipo.worlds.tabular import expected_return, optimal_policy
 
 ROOT = Path(__file__).resolve().parents[2]
-FIGURES = {"algorithm": "regression-game", "lqr": "lqr-explorer"}  # by page
+FIGURES = {
+    "algorithm": "regression-game",
+    "lqr": "lqr-explorer",
+    "keys": "keys-explorer",
+}  # by page
 
 
 def rows(chapter: str, name: str):
@@ -205,3 +214,102 @@ def test_keys_choose_what_was_run_and_nothing_else(shown, lqr_data):
     wanted = {str(n) for n in (2, 5, 10)}
     domains = opened.locator("select").first.locator("option:enabled").all_inner_texts()
     assert set(domains) == wanted
+
+
+# ------------------------------------------------------------------------------------ coloured keys
+
+COLORS = ("red", "grey")
+
+
+@pytest.fixture(scope="module")
+def keys_task():
+    return keys.Keys(ROOT / "data" / "tabulated")
+
+
+@pytest.fixture(scope="module")
+def keys_saved(keys_task):
+    arms = [arm for arm in keys.main_arms(20) if arm.label in ("ppo", "ensemble")]
+    policies = ROOT / "data" / "policies" / "keys"
+    return {arm.label: keys_task.saved(arm, policies)[0] for arm in arms}
+
+
+@pytest.fixture(scope="module")
+def keys_data(keys_task, keys_saved):
+    return keys_explorer.policies_in_states(keys_task, keys_saved, COLORS)
+
+
+def spoken(pattern: str, opened) -> float:
+    """A number from what has come out."""
+    return float(re.search(pattern, outcome(opened))[1])
+
+
+@pytest.mark.parametrize("color", COLORS)
+@pytest.mark.parametrize(("arm", "run"), [("ppo", 0), ("ppo", 2), ("ensemble", 1)])
+def test_returns_are_those_of_the_rows(shown, keys_data, color, arm, run):
+    opened = shown("keys-explorer", keys_data)
+    opened.locator("select").nth(0).select_option(color)
+    chosen = next(n for n in keys_data["policies"] if n.endswith(f"run {run}") and arm in n.lower())
+    opened.locator("select").nth(1).select_option(chosen)
+    cell = {"train_colors": "red+green", "color_encoding": "integer", "size": 5}
+    cell |= {"method": arm, "run": run, "domain": color}
+    found = value(rows("keys", "main"), "return_exact", **cell)
+    assert spoken(r"all layouts its expected return is ([\d.]+)\.", opened) == pytest.approx(
+        found, abs=0.002
+    )
+
+
+@pytest.mark.parametrize(("pressed", "temperature"), [(0, 1.0), (4, 2.0), (-4, 0.0)])
+def test_return_of_a_state_is_that_of_the_dynamic_programme(
+    shown, keys_task, keys_saved, keys_data, pressed, temperature
+):
+    opened = shown("keys-explorer", keys_data)
+    opened.locator("input[type=range]").focus()
+    for _ in range(abs(pressed)):  # a quarter each
+        opened.keyboard.press("ArrowRight" if pressed > 0 else "ArrowLeft")
+    table = keys_task.tasks["red"]
+    logits = keys_task.logits(keys_saved["ppo"], table.images)[:1].numpy()
+    scores = np.exp(logits / temperature) if temperature else logits == logits.max(-1)[..., None]
+    policy = scores / scores.sum(-1, keepdims=True)
+    here = np.eye(len(table.start))[keys_data["layouts"][0]]
+    returns, chances = expected_return(replace(table, start=here), policy)
+    assert spoken(r"an expected return of ([\d.]+),", opened) == pytest.approx(
+        returns[0], abs=0.002
+    )
+    assert spoken(r"with probability ([\d.]+)\.", opened) == pytest.approx(chances[0], abs=0.002)
+    percent = float(opened.locator(".bars button").nth(1).inner_text().split()[1])
+    seen = table.observation[keys_data["layouts"][0]]
+    assert percent == pytest.approx(100 * policy[0, seen, 1], abs=0.2)
+
+
+@pytest.mark.parametrize("layout", range(3))
+def test_keys_lead_to_the_goal(shown, keys_task, keys_data, layout):
+    """The best actions, pressed one after the other."""
+    opened = shown("keys-explorer", keys_data)
+    opened.locator("select").nth(2).select_option(str(layout))
+    table = keys_task.tasks["red"]
+    best, _ = optimal_policy(table)
+    state, step = keys_data["layouts"][layout], 0
+    while True:
+        action = best[step, state]
+        opened.locator(".bars button").nth(action).focus()
+        opened.keyboard.press("Enter")
+        step += 1
+        if table.goal[state, action]:
+            break
+        state = table.next_state[state, action]
+        column, row = table.position[state]
+        agent = opened.locator("svg[role=img]").get_attribute("aria-label")
+        assert agent.startswith(f"Agent at column {column}, row {row},")
+        assert f"Step {step} of" in outcome(opened)
+    assert f"Goal reached in step {step}: a return of {table.goal_reward[step - 1]:.3f}" in (
+        outcome(opened)
+    )
+    opened.locator(".buttons button").last.press("Space")
+    assert "Step 0 of" in outcome(opened)
+
+
+def test_a_most_likely_and_a_sampled_action_are_steps(shown, keys_data):
+    opened = shown("keys-explorer", keys_data)
+    for number, button in enumerate(opened.locator(".buttons button").all()[:2]):
+        button.press("Enter")
+        assert f"Step {number + 1} of" in outcome(opened)
