@@ -101,10 +101,11 @@ const interactive = (() => {
   }
 
   // Numbers and lines of the grid below a field that reaches from `top` to `bottom`.
-  function below(svg, x, ticks, [top, bottom], text, middle) {
+  function below(svg, x, ticks, [top, bottom], text, middle, digits = 0) {
     for (const tick of ticks) {
       shape(svg, "path", {d: `M${x(tick)} ${top}V${bottom}`, class: "grid"});
-      shape(svg, "text", {x: x(tick), y: bottom + 17, "text-anchor": "middle"}, number(tick));
+      shape(svg, "text", {x: x(tick), y: bottom + 17, "text-anchor": "middle"},
+        number(tick, digits));
     }
     shape(svg, "text", {x: middle, y: bottom + 38, "text-anchor": "middle"}, text);
   }

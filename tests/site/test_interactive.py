@@ -15,6 +15,9 @@ import torch
 from browse import PHONE, WIDE, new_context
 
 from experiments import keys
+from experiments.doors.arms import arms_of, trainings
+from experiments.doors.success import evaluation_doors
+from experiments.interactive import doors as door_explorer
 from experiments.interactive import keys as keys_explorer
 from experiments.interactive import lqr, page
 from experiments.store import Store, select
@@ -23,11 +26,12 @@ from ipo.lqr import oracle_cost
 from ipo.worlds.tabular import expected_return, optimal_policy
 
 ROOT = Path(__file__).resolve().parents[2]
-FIGURES = {
+FIGURES = {  # by page
     "algorithm": "regression-game",
     "lqr": "lqr-explorer",
     "keys": "keys-explorer",
-}  # by page
+    "door": "door-explorer",
+}
 
 
 def rows(chapter: str, name: str):
@@ -313,3 +317,61 @@ def test_a_most_likely_and_a_sampled_action_are_steps(shown, keys_data):
     for number, button in enumerate(opened.locator(".buttons button").all()[:2]):
         button.press("Enter")
         assert f"Step {number + 1} of" in outcome(opened)
+
+
+# ------------------------------------------------------------------------------------------ doors
+
+FRICTIONS = (0.1, 1.5)
+
+
+@pytest.fixture(scope="module")
+def success():
+    return rows("door", "success")
+
+
+@pytest.fixture(scope="module")
+def door_data(success):
+    policies, doors = ROOT / "data" / "policies" / "door", evaluation_doors()
+    arms = arms_of(trainings(190, 4096))
+    return door_explorer.doors_and_films(success, doors, arms, FRICTIONS, policies, 128)
+
+
+@pytest.mark.parametrize("arm", ["ppo", "ipo_half"])
+@pytest.mark.parametrize(("run", "friction"), [(0, 1.5), (1, 0.1), (2, 1.5)])
+def test_opened_doors_are_those_of_the_rows(shown, success, door_data, arm, run, friction):
+    opened = shown("door-explorer", door_data)
+    for chosen, option in zip(opened.locator("select").all(), (arm, run, friction), strict=True):
+        chosen.select_option(str(option))
+    steps = 24_903_680 if arm == "ppo" else 12_451_840
+    cell = {"method": arm[:3], "steps": steps, "run": run, "domain": str(friction)}
+    found = select(success, cell).set_index("door")["value"]
+    assert spoken(r"opens ([\d.]+) %", opened) == pytest.approx(100 * found.mean(), abs=0.05)
+    levers = evaluation_doors().set_index("door")["lever"]
+    weak = found[levers * 2 <= friction]  # newtons
+    said = f"{100 * weak.mean():.1f} % of {len(weak)};" if len(weak) else "there are none;"
+    assert f"(lever arms up to {friction / 2:.2f} m): {said}" in outcome(opened)
+    assert opened.locator("circle[class^=point-]").count() == len(found) + 2  # and the legend's
+
+
+def test_the_film_plays_and_changes_with_the_friction(shown, door_data):
+    opened = shown("door-explorer", door_data)
+    film = opened.locator("video")
+    length = film.evaluate(
+        "film => new Promise(done => { film.onloadedmetadata = () => done(film.duration); "
+        "if (film.readyState) done(film.duration); })"
+    )
+    assert length > 0
+    assert film.evaluate("film => film.paused")  # nothing moves unasked
+    before = film.get_attribute("src")
+    opened.locator("select").nth(2).focus()
+    opened.keyboard.press("ArrowUp")
+    assert film.get_attribute("src") != before
+
+
+def test_films_end_as_the_rows_say(door_data):
+    """But for a touch of the handle more or less on another processor."""
+    cases = door_data["cases"]
+    ends = [bool(int(case["opened"][door_data["filmed"]])) for case in cases]
+    assert {*ends} == {True, False}  # it divides the runs
+    same = [end == case["film_opened"] for end, case in zip(ends, cases, strict=True)]
+    assert sum(same) >= len(cases) - 2
