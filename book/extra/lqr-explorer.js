@@ -86,7 +86,8 @@
 
   function words(cell) {
     const sd = Math.sqrt(mean(cell.test.map((cost) => (cost - mean(cell.test)) ** 2)));
-    return `${name(cell)}, ${cell.num_domains} domains, ${cell.dim_distractor} distractors: cost ` +
+    return `Trained by ${name(cell)}, with ${cell.num_domains} domains and ` +
+      `${cell.dim_distractor} distractors: cost ` +
       `${number(mean(cell.test), 1)} ± ${number(sd, 1)} in a new domain (mean ± standard ` +
       `deviation of ${cell.test.length} runs), ${number(cell.train, 1)} in the training domains; ` +
       `the oracle ${number(data.oracle, 1)}. Of K, ` +

@@ -82,7 +82,7 @@ class _Films:
     def __init__(self, friction: float, door_seed: int, every: int) -> None:
         self.env, self.door_seed, self.every = DoorEnv(friction=friction), door_seed, every
         self.env.reset(seed=door_seed)
-        self.picture = pictures.camera(self.env.params, width=192, height=144)
+        self.picture = pictures.camera(self.env.params, width=176, height=132)
 
     def of(self, cell: Cell, run: int, policies: str | Path) -> dict[str, Any]:
         act = most_likely(load_players(cell, run, policies))

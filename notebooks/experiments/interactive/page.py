@@ -13,6 +13,8 @@ import matplotlib.pyplot as plt
 from IPython.display import HTML
 from matplotlib.figure import Figure
 
+MOST = 300_000  # characters of data: a page is to load fast
+
 
 def figure(name: str, data: Mapping[str, Any], fig: Figure, alt: str) -> HTML:
     """The figure whose script is ``book/extra/NAME.js``; a page has at most one.
@@ -27,9 +29,11 @@ def figure(name: str, data: Mapping[str, Any], fig: Figure, alt: str) -> HTML:
         alt: the same in words.
 
     Raises:
-        ValueError: data with NaN or infinite numbers.
+        ValueError: data with NaN or infinite numbers, or too many of them.
     """
     text = json.dumps(data, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
+    if len(text) > MOST:
+        raise ValueError(f"data of {name}: {len(text)} characters, must be at most {MOST}")
     text = text.replace("</", "<\\/")  # or it could end its element
     return HTML(
         f'<link rel="stylesheet" href="interactive.css">\n'
