@@ -19,9 +19,12 @@
     interactive.below(svg, x, data.bins, [TOP, BOTTOM], "lever arm [m]", (LEFT + RIGHT) / 2, 1);
     interactive.beside(svg, y, [0, 50, 100], [LEFT, RIGHT], "doors opened [%]", (TOP + BOTTOM) / 2);
     shape(svg, "path", {d: `M${x(needed)} ${TOP}V${BOTTOM}`, class: "needed"});
-    ends.forEach((end, door) => shape(svg, "circle", {
-      cx: x(data.levers[door]).toFixed(1), cy: (end === "1" ? OPENED : CLOSED) + 5 * (door % 3 - 1),
-      r: door === data.filmed ? 7 : 3.5, class: door === data.filmed ? "point-filmed" : "point-door"}));
+    ends.forEach((end, door) => {
+      const isFilmed = door === data.filmed, apart = 5 * (door % 3 - 1);
+      shape(svg, "circle", {
+        cx: x(data.levers[door]).toFixed(1), cy: (end === "1" ? OPENED : CLOSED) + apart,
+        r: isFilmed ? 7 : 3.5, class: isFilmed ? "point-filmed" : "point-door"});
+    });
     const bins = data.bins.slice(1).map((most, i) => [data.bins[i], most])
       .map(([least, most]) => [(least + most) / 2, between(ends, least, most)])
       .filter(([, found]) => found.length);
@@ -33,8 +36,10 @@
   const svg = interactive.picture(pictures, WIDTH, BOTTOM + 46);
   const film = element(pictures, "video", {controls: "", loop: "", playsinline: ""});
   film.muted = true;
-  interactive.legend(home, [["share", "opened, in an interval of lever arms"], ["point-door", "a door"],
-    ["point-filmed", "the door of the film"], ["needed", "what one motor needs"]]);
+  interactive.legend(home, [
+    ["share", "opened, in an interval of lever arms"], ["point-door", "a door"],
+    ["point-filmed", "the door of the film"], ["needed", "what one motor needs"],
+  ]);
   const controls = element(home, "div", {class: "controls"});
   const values = (key) => [...new Set(data.cases.map((shown) => shown[key]))].map((v) => [v, v]);
   const selects = {
@@ -56,10 +61,10 @@
     const ends = [...chosen.opened], needed = chosen.friction / data.gear;
     draw(ends, needed);
     const name = `${data.arms[chosen.arm]}, run ${chosen.run}, friction ${chosen.friction} N m`;
-    const end = `${chosen.film_opened ? "is open after" : "is not open after"} ${chosen.steps} of ` +
-      `at most ${data.max_steps} steps`;
-    output.textContent = `${name}: opens ${number(share(ends), 1)} % of ${ends.length} doors. Where ` +
-      `one motor is too weak (lever arms up to ${number(needed, 2)} m): ` +
+    const end = `${chosen.film_opened ? "is open" : "is not open"} after ${chosen.steps} of at ` +
+      `most ${data.max_steps} steps`;
+    output.textContent = `${name}: opens ${number(share(ends), 1)} % of ${ends.length} doors. ` +
+      `Where one motor is too weak (lever arms up to ${number(needed, 2)} m): ` +
       `${part(ends, 0, needed)}; beyond: ${part(ends, needed, Infinity)}. In the film, a door of ` +
       `lever arm ${number(data.levers[data.filmed], 2)} m ${end}.`;
     film.src = chosen.film;

@@ -69,7 +69,8 @@
       }
     }
     shape(svg, "rect", {x: -26, y: -26, width: 52, height: 52, transform: at(GOAL), class: "goal"});
-    shape(svg, "text", {transform: at(GOAL), dy: 5, "text-anchor": "middle", class: "on-goal"}, "goal");
+    const word = {transform: at(GOAL), dy: 5, "text-anchor": "middle", class: "on-goal"};
+    shape(svg, "text", word, "goal");
     const frame = {x: -30, y: -30, width: doorState ? 60 : 12, height: 60, transform: at(door)};
     shape(svg, "rect", {...frame, fill: doorState ? paint : "none", stroke: paint, class: "door"});
     if (doorState === 2) shape(svg, "circle", {r: 8, transform: at(door), class: "keyhole"});

@@ -35,7 +35,8 @@
   const bottom = TOP + rows * ROW;
   const left = interactive.picture(pictures, WIDTH, bottom + 46);
   const right = interactive.picture(pictures, WIDTH, bottom + 46);
-  interactive.legend(home, [["oracle", "the oracle's cost"], ["closed", "minimum norm, closed form"]]);
+  interactive.legend(home,
+    [["oracle", "the oracle's cost"], ["closed", "minimum norm, closed form"]]);
   const controls = interactive.element(home, "div", {class: "controls"});
   const numeric = (key) => all(key).sort((a, b) => a - b).map((n) => [n, n]);
   const of = (names, keys) => Object.keys(names).filter((key) => keys.has(key))
@@ -106,8 +107,9 @@
     drawCosts();
     drawGain(find(chosen));
     output.textContent = words(find(chosen));
-    left.setAttribute("aria-label", "Costs of all methods in a new domain: " +
-      data.cells.filter(is(sizes())).map((c) => `${name(c)} ${number(mean(c.test), 1)}`).join("; "));
+    const means = data.cells.filter(is(sizes()))
+      .map((cell) => `${name(cell)} ${number(mean(cell.test), 1)}`);
+    left.setAttribute("aria-label", `Costs of all methods in a new domain: ${means.join("; ")}`);
     right.setAttribute("aria-label", "Norms of parts of K: " +
       PARTS.map(([part, text]) => `${text} ${number(find(chosen)[part], 2)}`).join("; "));
   }

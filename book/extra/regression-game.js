@@ -30,9 +30,10 @@
 
   function draw(svg, rho, bound, path) {
     svg.replaceChildren();
-    const whole = [-3, -2, -1, 0, 1, 2, 3], middle = SIZE / 2;
-    interactive.below(svg, x, whole, [TOP, TOP + SIZE], "spurious weight of player 1", LEFT + middle);
-    interactive.beside(svg, y, whole, [LEFT, LEFT + SIZE], "spurious weight of player 2", TOP + middle);
+    const whole = [-3, -2, -1, 0, 1, 2, 3], [right, bottom] = [LEFT + SIZE, TOP + SIZE];
+    const text = "spurious weight of player";
+    interactive.below(svg, x, whole, [TOP, bottom], `${text} 1`, LEFT + SIZE / 2);
+    interactive.beside(svg, y, whole, [LEFT, right], `${text} 2`, TOP + SIZE / 2);
     shape(shape(svg, "clipPath", {id: "regression-game-clip"}), "rect",
       {x: LEFT, y: TOP, width: SIZE, height: SIZE});
     shape(svg, "rect", {x: LEFT, y: TOP, width: SIZE, height: SIZE, class: "frame"});

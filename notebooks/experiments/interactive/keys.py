@@ -20,7 +20,7 @@ from ipo.worlds.tabular import TabularTask, state_of
 
 NUM_RUNS = 3  # the first ones of every arm, whatever came out
 LAYOUTS = (0, 1, 2)  # seeds of MiniGrid's reset, likewise
-STEPS = 1000  # of a log-probability from one to the next, in 16 bits
+STEPS = 1000  # of a log-probability within one nat, so that 16 bits hold it
 
 
 def policies_in_states(
