@@ -1,17 +1,14 @@
 // The game of two players with one spurious weight each, to be played with sliders.
-// Plain JavaScript, no library, works from a folder. Used on the page "From IRM to IPO", where a
-// static picture stands in its place without scripts. Names follow ipo/causality/small_games.py.
+// Used on the page "From IRM to IPO". Names follow ipo/causality/small_games.py.
 "use strict";
 (() => {
-  const LIMIT = 3.2, SIZE = 400, ROUNDS = 6000, RATE = 0.1;
-  const home = document.getElementById("regression-game");
-  if (!home) return;
-
-  const CONTROLS = [
-    {key: "rho1", text: "spurious coefficient of domain 1", min: -1, max: 1, value: 0.8},
-    {key: "rho2", text: "spurious coefficient of domain 2", min: -1, max: 1, value: -0.4},
-    {key: "bound", text: "bound on each player", min: 0.1, max: 3, value: 2},
-  ];
+  const {shape, number} = interactive;
+  const LIMIT = 3.2, ROUNDS = 6000, RATE = 0.1;
+  const LEFT = 48, SIZE = 380, TOP = 8;
+  const {home, data} = interactive.figure("regression-game");
+  const ends = [-LIMIT, LIMIT];
+  const x = interactive.scale(ends, [LEFT, LEFT + SIZE]);
+  const y = interactive.scale(ends, [TOP + SIZE, TOP]);
 
   // One plain gradient step of each player in turn, as in play() with bounds.
   function play(rho, bound) {
@@ -31,113 +28,66 @@
     return [...rho, -bound, 0, bound].sort((a, b) => a - b)[2];
   }
 
-  const SVG = "http://www.w3.org/2000/svg";
-  function add(parent, name, attributes, text) {
-    const node = document.createElementNS(SVG, name);
-    for (const [key, value] of Object.entries(attributes)) node.setAttribute(key, value);
-    if (text) node.textContent = text;
-    parent.append(node);
-    return node;
-  }
-  const x = (u) => SIZE * (u + LIMIT) / (2 * LIMIT);
-  const y = (v) => SIZE * (LIMIT - v) / (2 * LIMIT);
-
   function draw(svg, rho, bound, path) {
     svg.replaceChildren();
-    const clip = add(add(svg, "clipPath", {id: "regression-game-clip"}), "rect",
-      {x: 0, y: 0, width: SIZE, height: SIZE});
-    clip.setAttribute("fill", "none");
-    const inside = add(svg, "g", {"clip-path": "url(#regression-game-clip)"});
-    add(inside, "rect", {x: 0.5, y: 0.5, width: SIZE - 1, height: SIZE - 1, class: "frame"});
-    add(inside, "path", {d: `M0 ${y(0)}H${SIZE}M${x(0)} 0V${SIZE}`, class: "axis"});
-    rho.forEach((wish, d) => add(inside, "line", {
-      x1: x(-LIMIT), y1: y(2 * wish + LIMIT), x2: x(LIMIT), y2: y(2 * wish - LIMIT),
+    const whole = [-3, -2, -1, 0, 1, 2, 3], [right, bottom] = [LEFT + SIZE, TOP + SIZE];
+    const text = "spurious weight of player";
+    interactive.below(svg, x, whole, [TOP, bottom], `${text} 1`, LEFT + SIZE / 2);
+    interactive.beside(svg, y, whole, [LEFT, right], `${text} 2`, TOP + SIZE / 2);
+    shape(shape(svg, "clipPath", {id: "regression-game-clip"}), "rect",
+      {x: LEFT, y: TOP, width: SIZE, height: SIZE});
+    shape(svg, "rect", {x: LEFT, y: TOP, width: SIZE, height: SIZE, class: "frame"});
+    const inside = shape(svg, "g", {"clip-path": "url(#regression-game-clip)"});
+    rho.forEach((wish, d) => shape(inside, "line", {
+      x1: x(ends[0]), y1: y(2 * wish - ends[0]), x2: x(ends[1]), y2: y(2 * wish - ends[1]),
       class: `player${d + 1}`}));
     if (Number.isFinite(bound)) {
-      add(inside, "rect", {x: x(-bound), y: y(bound), width: x(bound) - x(-bound),
+      shape(inside, "rect", {x: x(-bound), y: y(bound), width: x(bound) - x(-bound),
         height: y(-bound) - y(bound), class: "bound"});
     }
-    add(inside, "polyline", {class: "path",
+    shape(inside, "polyline", {class: "path",
       points: path.map(([u, v]) => `${x(u).toFixed(1)},${y(v).toFixed(1)}`).join(" ")});
-    add(inside, "circle", {cx: x(0), cy: y(0), r: 4, class: "start"});
+    shape(inside, "circle", {cx: x(0), cy: y(0), r: 4, class: "point-start"});
     const [u, v] = path[path.length - 1];
-    add(inside, "circle", {cx: x(u), cy: y(v), r: 7, class: "end"});
-    add(svg, "text", {x: SIZE / 2, y: SIZE + 24, "text-anchor": "middle"},
-      "spurious weight of player 1");
-    add(svg, "text", {x: -SIZE / 2, y: -10, "text-anchor": "middle", transform: "rotate(-90)"},
-      "spurious weight of player 2");
+    shape(inside, "circle", {cx: x(u), cy: y(v), r: 7, class: "point-end"});
   }
 
-  function number(value) {
-    return value.toFixed(2).replace("-0.00", "0.00").replace("-", "−");
+  function words(rho, bound, [u, v]) {
+    const ends = `The players end at ${number(u, 2)} and ${number(v, 2)}, their average at ` +
+      `${number((u + v) / 2, 2)}. `;
+    const drift = `That is only where ${ROUNDS} rounds end: they go on for ever, and there is no ` +
+      "equilibrium. The average stays near that of pooled training. ";
+    const theory = Number.isFinite(bound) ? `The theorem says ${number(vote(rho, bound), 2)}. `
+      : rho[0] === rho[1] ? "Both want the same: this is an equilibrium. " : drift;
+    return ends + theory +
+      `Pooled least squares: ${number((rho[0] + rho[1]) / 2, 2)}; the invariant predictor: 0.`;
   }
 
-  const style = document.createElement("style");
-  style.textContent = `
-    /* In dark mode the theme puts outputs on a light card; this one has the page's own colours. */
-    .cell_output .text_html:has(#regression-game) { background: transparent !important; }
-    #regression-game { max-width: 30rem; margin: 1rem auto; color: var(--pst-color-text-base, #222); }
-    #regression-game svg { width: 100%; height: auto; color: var(--pst-color-text-base, #222); }
-    #regression-game text { fill: currentColor; font-size: 15px; }
-    #regression-game .frame { fill: none; stroke: currentColor; opacity: 0.4; }
-    #regression-game .axis { stroke: currentColor; opacity: 0.25; }
-    #regression-game .player1 { stroke: #e8590c; stroke-width: 2.5; }
-    #regression-game .player2 { stroke: #3b9ae1; stroke-width: 2.5; stroke-dasharray: 9 4; }
-    #regression-game .bound { fill: none; stroke: currentColor; stroke-width: 2; }
-    #regression-game .path { fill: none; stroke: currentColor; stroke-width: 2; }
-    #regression-game .start { fill: currentColor; }
-    #regression-game .end { fill: #12a37c; stroke: currentColor; }
-    #regression-game label { display: grid; grid-template-columns: 1fr 3.5rem; margin-top: 0.4rem; }
-    #regression-game label input[type=range] { grid-column: 1 / 3; width: 100%; }
-    #regression-game label span:nth-child(2) { text-align: right; }
-    #regression-game .switch { display: block; }
-    #regression-game output { display: block; margin-top: 0.6rem; min-height: 6rem; }`;
-  const svg = document.createElementNS(SVG, "svg");
-  svg.setAttribute("viewBox", `-34 -6 ${SIZE + 40} ${SIZE + 38}`);
-  svg.setAttribute("role", "img");
-  const output = document.createElement("output");
-  output.setAttribute("aria-live", "polite");
-  const inputs = {}, shown = {};
-  home.replaceChildren(style, svg);
-  for (const control of CONTROLS) {
-    const label = document.createElement("label");
-    const name = document.createElement("span");
-    shown[control.key] = document.createElement("span");
-    const input = document.createElement("input");
-    Object.assign(input, {type: "range", min: control.min, max: control.max, step: 0.05});
-    input.value = control.value;
-    name.textContent = control.text;
-    label.append(name, shown[control.key], input);
-    inputs[control.key] = input;
-    home.append(label);
-  }
-  const label = document.createElement("label");
-  label.className = "switch";
-  const free = document.createElement("input");
-  free.type = "checkbox";
-  label.append(free, " no bound");
-  home.append(label, output);
+  const pictures = interactive.element(home, "div", {class: "pictures"});
+  const svg = interactive.picture(pictures, LEFT + SIZE + 12, TOP + SIZE + 44);
+  interactive.legend(home, [
+    ["player1", "player 1 is content"], ["player2", "player 2 is content"], ["bound", "bound"],
+    ["path", "their path"], ["point-start", "start"], ["point-end", "end"],
+  ]);
+  const controls = interactive.element(home, "div", {class: "controls"});
+  const slider = (text, least, most, value) => interactive.range(controls, text,
+    {min: least, max: most, step: 0.05, value, shown: (chosen) => number(chosen, 2)});
+  const wishes = data.wishes.map((wish, d) =>
+    slider(`spurious coefficient of domain ${d + 1}`, -1, 1, wish));
+  const bounded = slider("bound on each player", 0.1, 3, data.bound);
+  const free = interactive.checkbox(controls, "no bound");
+  const output = interactive.outcome(home);
 
   function update() {
-    for (const key of Object.keys(inputs)) shown[key].textContent = number(+inputs[key].value);
-    inputs.bound.disabled = free.checked;
-    const rho = [+inputs.rho1.value, +inputs.rho2.value];
-    const bound = free.checked ? Infinity : +inputs.bound.value;
+    bounded.disabled = free.checked;
+    const rho = wishes.map((input) => +input.value);
+    const bound = free.checked ? Infinity : +bounded.value;
     const path = play(rho, bound);
     draw(svg, rho, bound, path);
-    const [u, v] = path[path.length - 1];
-    const ends = `The players end at ${number(u)} and ${number(v)}, their average at ` +
-      `${number((u + v) / 2)}. `;
-    const theory = free.checked
-      ? (rho[0] === rho[1] ? "Both want the same: this is an equilibrium. "
-        : `That is only where ${ROUNDS} rounds end: they go on for ever, and there is no ` +
-          "equilibrium. The average stays near that of pooled training. ")
-      : `The theorem says ${number(vote(rho, bound))}. `;
-    output.textContent = ends + theory +
-      `Pooled least squares: ${number((rho[0] + rho[1]) / 2)}; the invariant predictor: 0.`;
+    output.textContent = words(rho, bound, path[path.length - 1]);
     svg.setAttribute("aria-label", "Plane of the two players' spurious weights with their " +
       "best-response lines, the bound and the trajectory. " + output.textContent);
   }
-  for (const input of [...Object.values(inputs), free]) input.addEventListener("input", update);
+  for (const input of [...wishes, bounded, free]) input.addEventListener("input", update);
   update();
 })();

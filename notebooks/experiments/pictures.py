@@ -91,21 +91,25 @@ def side_by_side(episodes: Sequence[Sequence[np.ndarray]], gap: int = 8) -> list
     ]
 
 
-def video(frames: Sequence[np.ndarray], caption: str, fps: int = 4) -> str:
-    """HTML of a film inside the page, with its last frame as poster and a caption."""
+def film_address(frames: Sequence[np.ndarray], fps: float) -> str:
+    """A film as the address of a video."""
     even = [np.pad(f, ((0, f.shape[0] % 2), (0, f.shape[1] % 2), (0, 0)), "edge") for f in frames]
     with TemporaryDirectory() as folder:
         path = Path(folder) / "film.mp4"
         iio.imwrite(path, np.stack(even), fps=fps, codec="libx264", macro_block_size=2)
-        film = base64.b64encode(path.read_bytes()).decode()
+        return f"data:video/mp4;base64,{base64.b64encode(path.read_bytes()).decode()}"
+
+
+def video(frames: Sequence[np.ndarray], caption: str, fps: int = 4) -> str:
+    """HTML of a film inside the page, with its last frame as poster and a caption."""
     picture = io.BytesIO()
-    iio.imwrite(picture, even[-1], extension=".png")
+    iio.imwrite(picture, frames[-1], extension=".png")
     poster = base64.b64encode(picture.getvalue()).decode()
     text = html.escape(caption)
     return (
         f'<div class="film"><video controls loop muted playsinline aria-label="{text}" '
         f'width="100%" poster="data:image/png;base64,{poster}">'
-        f'<source type="video/mp4" src="data:video/mp4;base64,{film}"></video>'
+        f'<source type="video/mp4" src="{film_address(frames, fps)}"></video>'
         f"<p>{text}</p></div>"
     )
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import io
 from collections.abc import Mapping, Sequence
 
 import matplotlib.pyplot as plt
@@ -46,14 +44,6 @@ def label_outside(axes: np.ndarray, x: str, y: str) -> None:
         ax.set_xlabel(x)
     for ax in axes[:, 0]:
         ax.set_ylabel(y)
-
-
-def embedded(fig: Figure) -> str:
-    """The figure as an address of an image; the figure itself is not shown."""
-    picture = io.BytesIO()
-    fig.savefig(picture, format="png")
-    plt.close(fig)
-    return f"data:image/png;base64,{base64.b64encode(picture.getvalue()).decode()}"
 
 
 def draw_path(ax: Axes, path: np.ndarray, method: str, name: str, size: float = 7) -> None:
