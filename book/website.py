@@ -15,6 +15,7 @@ import claims
 import costs
 import licences
 import provenance
+import reading_time
 import reliability
 from chapters import Notebook, tree_hash
 from experiments.files import replace_text
@@ -57,6 +58,7 @@ def stage(root: Path, source: Path, notebooks: list[Notebook], profile: str) -> 
     benchmarks.write_fragment(source)
     costs.write_fragment(source)
     licences.write_fragment(source)
+    reading_time.write_fragments(source, notebooks)
     run_times = source / "_generated" / "run_times.md"
     run_times.write_text(run_times_tables(notebooks, profile), encoding="utf-8")
 
