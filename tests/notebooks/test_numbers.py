@@ -19,7 +19,7 @@ NO_PROSE = re.compile(
     r"""
     # Code, and what is included; the lines of other directives, but for the answers to questions.
     ^(?P<fence>`{3,})(?=\S)(?!\{(?:exercise|prf:)).*?^(?P=fence)\s*$
-    | ^(?:`{3,}|:{3,}(?!\{dropdown\}))[^\n]*$ | ^:[\w-]+:[^\n]*$
+    | ^(?:`{3,}|:{3,}(?!:*\{dropdown\}))[^\n]*$ | ^:[\w-]+:[^\n]*$
     # Glue and citations, which are roles; code in the line; formulas of their own lines.
     | \{[\w:+-]+\}`[^`]*` | `[^`]*` | \$\$.*?\$\$
     # Labels, and the targets of links.
