@@ -23,8 +23,9 @@ def write_fragments(folder: Path, notebooks: list[Notebook]) -> None:
     for notebook in notebooks:
         words, seconds = count_words(notebook.read()), notebook.read_record()["seconds"]
         line = (
-            f"**Time:** about {minutes(words)} minutes to read ({words:,} words, without code, equations "
-            f"and exercises); its notebook ran in {seconds:.0f} seconds when this site was built.\n"
+            f"**Time:** about {minutes(words)} minutes to read ({words:,} words, without code, "
+            "equations and exercises); "
+            f"its notebook ran in {seconds:.0f} seconds when this site was built.\n"
         )
         (target / f"{notebook.name}.md").write_text(line, encoding="utf-8")
         row = [f"{{doc}}`{notebook.name}`", f"{words:,}", f"{minutes(words)}", f"{seconds:.0f}"]

@@ -13,6 +13,7 @@ import nbformat
 import benchmarks
 import claims
 import costs
+import decks
 import licences
 import provenance
 import reading_time
@@ -33,7 +34,9 @@ def build_site(root: Path, build: Path, notebooks: list[Notebook], profile: str)
     sources = tree_hash(source)
     if built_from.exists() and built_from.read_text() == f"{sources} {tree_hash(html)}\n":
         return False
-    replace_folder(html, run_jupyter_book(source, build / "new"))
+    pages = run_jupyter_book(source, build / "new")
+    decks.build(source, build / "new" / "slides", pages, notebooks)
+    replace_folder(html, pages)
     replace_text(built_from, f"{sources} {tree_hash(html)}\n")
     shutil.rmtree(build / "new")
     return True
@@ -59,6 +62,7 @@ def stage(root: Path, source: Path, notebooks: list[Notebook], profile: str) -> 
     costs.write_fragment(source)
     licences.write_fragment(source)
     reading_time.write_fragments(source, notebooks)
+    decks.write_fragment(source, decks.decks_of(source, notebooks))
     run_times = source / "_generated" / "run_times.md"
     run_times.write_text(run_times_tables(notebooks, profile), encoding="utf-8")
 
