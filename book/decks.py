@@ -11,6 +11,7 @@ from pathlib import Path
 
 from myst_nb.core.variables import format_plain_text
 from nbformat import NotebookNode
+from playwright.sync_api import sync_playwright
 
 from chapters import Notebook
 from experiments.orphans import python
@@ -170,18 +171,17 @@ def run_sphinx(source: Path, target: Path) -> None:
 
 
 def print_all(folder: Path, decks: list[str]) -> None:
-    """A PDF of each deck; without Chromium there is none."""
-    program = chromium()
-    for deck in decks if program else []:
-        subprocess.run(
-            [
-                program,
-                *("--headless", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage"),
-                *("--no-pdf-header-footer", "--virtual-time-budget=20000"),
-                f"--print-to-pdf={folder / deck}.pdf",
-                f"{(folder / deck).resolve().as_uri()}.html?print-pdf",
-            ],
-            check=True,
-            capture_output=True,
-            timeout=120,
+    """A PDF of each deck, one page for each slide; without Chromium there is none."""
+    if not chromium():
+        return
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(
+            executable_path=chromium(), args=["--no-sandbox", "--disable-dev-shm-usage"]
         )
+        page = browser.new_page()
+        for deck in decks:
+            page.goto(f"{(folder / deck).resolve().as_uri()}.html?print-pdf", wait_until="load")
+            page.evaluate("() => window.MathJax?.startup?.promise")
+            page.wait_for_selector(".pdf-page")
+            page.pdf(path=folder / f"{deck}.pdf", prefer_css_page_size=True, print_background=True)
+        browser.close()
