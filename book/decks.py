@@ -6,10 +6,10 @@ from __future__ import annotations
 import re
 import shutil
 import subprocess
+from ast import literal_eval
 from base64 import b64decode
 from pathlib import Path
 
-from myst_nb.core.variables import format_plain_text
 from nbformat import NotebookNode
 from playwright.sync_api import sync_playwright
 
@@ -110,7 +110,7 @@ class Filler:
         if key not in self.glued:
             raise BuildError(f"Slides: no number is called {key!r} in the chapter")
         plain = next(text for kind, text in self.glued[key].items() if kind.endswith("text/plain"))
-        return format_plain_text(plain, form)
+        return formatted(plain, form)
 
     def figure(self, name: str) -> str:
         """An image with its description."""
@@ -138,6 +138,16 @@ class Filler:
 
     def cell(self, name: str) -> str:
         return next(cell.source for cell in self.chapter.cells if cell.id == name)
+
+
+def formatted(plain: str, form: str) -> str:
+    """A glued value as the page of the chapter shows it."""
+    try:
+        value = literal_eval(plain)
+    except ValueError:  # nan, inf
+        value = plain
+    kind = {"d": int, "s": str}.get(form[-1], float)
+    return format(kind(value), form)
 
 
 def write_image(outputs: list[NotebookNode], path: Path) -> Path:

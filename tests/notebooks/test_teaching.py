@@ -151,6 +151,14 @@ def test_slides_with_a_part_that_is_not_there_end_the_build(filler, part):
         filler.fill(part)
 
 
+@pytest.mark.parametrize(
+    ("plain", "form", "shown"),
+    [("0.5", ".0%", "50%"), ("'[1, 2]'", "s", "[1, 2]"), ("7.0", "d", "7"), ("nan", ".1f", "nan")],
+)
+def test_slides_show_numbers_as_the_chapter_does(plain, form, shown):
+    assert decks.formatted(plain, form) == shown
+
+
 def test_every_chapter_has_slides():
     assert {path.stem for path in (ROOT / "book" / "slides").glob("*.md")} == {
         path.stem for path in CHAPTERS
