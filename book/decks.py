@@ -31,6 +31,7 @@ revealjs_script_conf = {
     "pdfSeparateFragments": False,
 }
 """
+KINDS = {"html": "to show", "pdf": "to print"}
 PART = re.compile(r"^\{(figure|question|summary)\}`([\w-]+)`$", re.MULTILINE)
 GLUED = re.compile(r"\{glue:text\}`(\w+)(?::([^`]+))?`")
 QUESTION = re.compile(
@@ -45,19 +46,14 @@ ANSWER = re.compile(
 
 def write_fragment(folder: Path, decks: list[str]) -> None:
     """Writes ``_generated/slides.md`` under ``folder``: links to the slides of each chapter."""
-    lines = [f"- {{doc}}`/{deck}`: {link(deck, 'html')}{pdf(deck)}" for deck in decks]
+    kinds = ["html", "pdf"] if chromium() else ["html"]
+    lines = ["| chapter | slides |", "|:--|:--|"]
+    for deck in decks:
+        links = ", ".join(f'<a href="slides/{deck}.{kind}">{KINDS[kind]}</a>' for kind in kinds)
+        lines.append(f"| {{doc}}`{deck}` | {links} |")
     target = Path(folder) / "_generated"
     target.mkdir(parents=True, exist_ok=True)
     (target / "slides.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
-
-
-def pdf(deck: str) -> str:
-    return f", {link(deck, 'pdf')}" if chromium() else ""
-
-
-def link(deck: str, kind: str) -> str:
-    words = {"html": "slides", "pdf": "for print (PDF)"}[kind]
-    return f'<a href="slides/{deck}.{kind}">{words}</a>'
 
 
 def chromium() -> str | None:
