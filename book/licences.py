@@ -13,6 +13,7 @@ NOTICES = (
     ("pydata-sphinx-theme", "bootstrap.js.LICENSE.txt"),
     ("pydata-sphinx-theme", "fontawesome.js.LICENSE.txt"),
     ("sphinx-copybutton", "clipboard.min.js"),
+    ("sphinx-revealjs", "reveal.js"),
 )
 
 
@@ -37,7 +38,7 @@ def notice(package: str, name: str) -> str:
     comment = path.read_text(encoding="utf-8").split("*/")[0]
     lines = [line.strip(" */!") for line in comment.splitlines()]
     title = next(line for line in lines if line)
-    terms = next(line for line in lines if "Licen" in line)
+    terms = next(line for line in lines if "licen" in line.lower())
     return f"| {title} | {package} | {terms} |"
 
 

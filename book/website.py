@@ -13,11 +13,13 @@ import nbformat
 import benchmarks
 import claims
 import costs
+import decks
 import deviations
 import fairness
 import hyperparameters
 import licences
 import provenance
+import reading_time
 import reliability
 from chapters import Notebook, tree_hash
 from experiments.files import replace_text
@@ -43,7 +45,9 @@ def build_site(root: Path, build: Path, notebooks: list[Notebook], profile: str)
     sources = tree_hash(source)
     if built_from.exists() and built_from.read_text() == f"{sources} {tree_hash(html)}\n":
         return False
-    replace_folder(html, run_jupyter_book(source, build / "new"))
+    pages = run_jupyter_book(source, build / "new")
+    decks.build(source, build / "new" / "slides", pages, notebooks)
+    replace_folder(html, pages)
     replace_text(built_from, f"{sources} {tree_hash(html)}\n")
     shutil.rmtree(build / "new")
     return True
@@ -73,6 +77,8 @@ def stage(root: Path, source: Path, notebooks: list[Notebook], profile: str) -> 
     }
     for name, text in tables.items():
         write_fragment(source, name, text)
+    reading_time.write_fragments(source, notebooks)
+    decks.write_fragment(source, decks.decks_of(source, notebooks))
 
 
 def run_jupyter_book(source: Path, output: Path) -> Path:
