@@ -14,12 +14,8 @@ import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
-from nbgrader.converters import GenerateAssignment
-from nbgrader.converters.base import NbGraderException
-from nbgrader.coursedir import CourseDirectory
-from traitlets.config import Config
-
-from experiments.files import replace_bytes
+from chapters import tree_hash
+from experiments.files import replace_bytes, replace_text
 from messages import BuildError, shown
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -43,6 +39,22 @@ def main() -> int:
         print(error, file=sys.stderr)
         return 1
     return 0
+
+
+def write_download(source: Path, build: Path) -> None:
+    """The students' package for the site in ``source``; kept in ``build`` while it is current."""
+    target = build / "teaching"
+    target.mkdir(exist_ok=True)
+    archive, made_of = target / f"{NAMES[write_student]}.zip", target / "made_of"
+    with tempfile.TemporaryDirectory() as scratch:
+        write_instructor(Path(scratch))
+        shutil.copy(SOURCES / "students.md", scratch)
+        digest = tree_hash(Path(scratch))
+    if not (archive.exists() and made_of.exists() and made_of.read_text() == digest):
+        write_archive(target, write_student)
+        replace_text(made_of, digest)
+    (source / "_downloads").mkdir()
+    shutil.copy(archive, source / "_downloads")
 
 
 def write_archive(target: Path, write: Callable[[Path], None]) -> Path:
@@ -93,6 +105,11 @@ def release(course: Path) -> Path:
     Raises:
         BuildError: what nbgrader says of a source.
     """
+    from nbgrader.converters import GenerateAssignment  # takes seconds; most builds need none
+    from nbgrader.converters.base import NbGraderException
+    from nbgrader.coursedir import CourseDirectory
+    from traitlets.config import Config
+
     config = Config()
     config.CourseDirectory.root = str(course)
     config.GenerateAssignment.no_database = True
@@ -104,7 +121,7 @@ def release(course: Path) -> Path:
         try:
             converter.start()
         except NbGraderException as error:
-            raise BuildError(f"{assignment}: nbgrader makes no students' version: {error}") from error
+            raise BuildError(f"{assignment}: no students' version: {error}") from error
     return course / "release"
 
 

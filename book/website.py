@@ -16,6 +16,7 @@ import costs
 import licences
 import provenance
 import reliability
+import teaching
 from chapters import Notebook, tree_hash
 from experiments.files import replace_text
 from experiments.orphans import python
@@ -57,6 +58,7 @@ def stage(root: Path, source: Path, notebooks: list[Notebook], profile: str) -> 
     benchmarks.write_fragment(source)
     costs.write_fragment(source)
     licences.write_fragment(source)
+    teaching.write_download(source, source.parent)
     run_times = source / "_generated" / "run_times.md"
     run_times.write_text(run_times_tables(notebooks, profile), encoding="utf-8")
 

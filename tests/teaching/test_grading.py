@@ -5,11 +5,8 @@ import shutil
 import sys
 from pathlib import Path
 
-import nbformat
 import pytest
-from graded import role
 from nbgrader.apps import NbGraderAPI
-from nbgrader.converters import GenerateFeedback
 from traitlets.config import Config
 
 import teaching
