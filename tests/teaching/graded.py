@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import html
+import json
+import re
+import zipfile
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -15,6 +19,9 @@ import teaching
 
 ROOT = Path(__file__).resolve().parents[2]
 SOURCES = sorted((ROOT / "notebooks" / "exercises").glob("*/*.ipynb"))
+SHORTEST = 20  # characters of a line that gives something away
+READABLE = {".html", ".ipynb", ".js", ".json", ".md", ".py", ".txt"}
+TAGS = re.compile(r"<[^>]*>")
 
 
 def role(cell: NotebookNode) -> str:
@@ -98,3 +105,51 @@ def complaint(answer: str, exercise: Exercise, names: dict) -> BaseException | N
     except Exception as error:
         return error
     return None
+
+
+def secrets() -> set[str]:
+    """Lines of reference solutions and answers that stand nowhere where a student may look."""
+    hidden, shown = [], []
+    for path in SOURCES:
+        for cell in nbformat.read(path, as_version=4).cells:
+            if role(cell) == "essay":
+                hidden.append(cell.source)
+                continue
+            _, *parts = f"### END SOLUTION{cell.source}".split("### END SOLUTION")
+            for part in parts:
+                open_part, _, solution = part.partition("### BEGIN SOLUTION")
+                shown.append(open_part)
+                hidden.append(solution)
+    shown += [path.read_text(encoding="utf-8") for path in (ROOT / "ipo").rglob("*.py")]
+    known = "\n".join(shown)
+    lines = {line.strip() for text in hidden for line in text.splitlines()}
+    return {line for line in lines if len(line) >= SHORTEST and line not in known}
+
+
+def leaks(folder: Path) -> list[tuple[str, str]]:
+    """Files of a folder, and in archives of it, that have one of the secrets."""
+    lines = secrets()
+    contents = {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in folder.rglob("*")
+        if path.suffix in READABLE
+    }
+    for path in folder.rglob("*.zip"):
+        with zipfile.ZipFile(path) as archive:
+            contents |= {
+                f"{path.name}/{name}": archive.read(name)
+                for name in archive.namelist()
+                if Path(name).suffix in READABLE
+            }
+    return [
+        (name, line)
+        for name, content in contents.items()
+        for line in find(lines, content.decode(errors="replace"))
+    ]
+
+
+def find(lines: set[str], text: str) -> list[str]:
+    """Which of the lines are in a text, as it is, in JSON or in HTML."""
+    plain = html.unescape(TAGS.sub("", text))
+    in_json = {line: json.dumps(line, ensure_ascii=False)[1:-1] for line in lines}
+    return [line for line in lines if line in plain or in_json[line] in text]
