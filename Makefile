@@ -11,7 +11,7 @@ LOCK := .venv/bin/uv pip compile --quiet --universal --python-version 3.11.5 --g
 	--no-annotate --custom-compile-command "make lock"
 
 .DEFAULT_GOAL := help
-.PHONY: help setup book test verify confirm reproduce claims serve lab lint format lock newest clean
+.PHONY: help setup book teaching test verify confirm reproduce claims serve lab lint format lock newest clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## /{printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -21,6 +21,9 @@ setup: ## the environment in .venv (every other target does it first)
 
 book: setup ## execute what changed and build the site [PROFILE=class] [JOBS=cores]
 	@$(IN_VENV) book/build.py --profile $(PROFILE) $(if $(JOBS),--jobs $(JOBS)) $(SETUP_SECONDS)
+
+teaching: setup ## archives of exercises, lab and homework for students and instructors
+	@$(IN_VENV) book/teaching.py
 
 test: ## set-up, browser included, the witnesses, and the default test suite
 	@$(PYTHON) book/setup.py --system
@@ -54,7 +57,8 @@ format: setup ## ruff's format and safe repairs
 	@$(IN_VENV) -m ruff check --fix && $(IN_VENV) -m ruff format
 
 lock: setup ## the hashes of the pinned packages anew, after a change of environment.txt
-	@sed '/^torch==/d' environment.txt | $(LOCK) - --output-file book/locks/packages.txt >/dev/null
+	@sed '/^torch==/d' environment.txt | $(LOCK) - --excludes book/locks/excluded.txt \
+		--output-file book/locks/packages.txt >/dev/null
 	@grep '^torch==' environment.txt \
 		| $(LOCK) --constraint environment.txt - --output-file book/locks/torch.txt >/dev/null
 	@grep '^uv==' environment.txt | $(LOCK) - --output-file book/locks/uv.txt >/dev/null
@@ -64,6 +68,7 @@ newest: ## the tests with the newest versions of all direct dependencies, in .ne
 	@$(PYTHON) -m venv --clear .newest
 	@sed '/^# What the packages above need/,$$d; /^jupyter-book==/!s/==[^ ]*//' environment.txt \
 		| .newest/bin/python -m pip install --quiet --requirement /dev/stdin
+	@.newest/bin/python -m pip uninstall --quiet --yes --requirement book/locks/excluded.txt
 	@.newest/bin/python -m pip install --quiet --no-deps --no-build-isolation \
 		--editable . --editable notebooks
 	@.newest/bin/python -m pip freeze

@@ -21,6 +21,7 @@ import licences
 import provenance
 import reading_time
 import reliability
+import teaching
 from chapters import Notebook, tree_hash
 from experiments.files import replace_text
 from experiments.orphans import python
@@ -79,6 +80,7 @@ def stage(root: Path, source: Path, notebooks: list[Notebook], profile: str) -> 
         write_fragment(source, name, text)
     reading_time.write_fragments(source, notebooks)
     decks.write_fragment(source, decks.decks_of(source, notebooks))
+    teaching.write_download(source, source.parent)
 
 
 def run_jupyter_book(source: Path, output: Path) -> Path:

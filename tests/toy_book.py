@@ -10,6 +10,7 @@ import claims
 import costs
 import provenance
 import sources
+import teaching
 
 ROOT = Path(__file__).resolve().parents[1]
 PROFILES = {
@@ -72,5 +73,6 @@ def in_toy(patch: pytest.MonkeyPatch, root: Path) -> None:
     """The toy's own package, and no claims."""
     patch.setattr(sources, "PACKAGES", {"ipo": root / "ipo"})
     patch.setattr(claims, "write_fragments", lambda folder: None)
+    patch.setattr(teaching, "write_download", lambda source, build: None)
     for page in (provenance, costs):
         patch.setattr(page, "overview", lambda: "")

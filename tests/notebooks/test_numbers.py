@@ -18,7 +18,7 @@ DEFINITIONS = yaml.safe_load((Path(__file__).parent / "definitions.yml").read_te
 NO_PROSE = re.compile(
     r"""
     # Code, and what is included; the lines of other directives, but for the answers to questions.
-    ^(?P<fence>`{3,})(?=\S)(?!\{(?:exercise|prf:)).*?^(?P=fence)\s*$
+    ^(?P<fence>`{3,})(?=\S)(?!\{(?:exercise|solution|prf:)).*?^(?P=fence)\s*$
     | ^(?:`{3,}|:{3,}(?!:*\{dropdown\}))[^\n]*$ | ^:[\w-]+:[^\n]*$
     # Glue and citations, which are roles; code in the line; formulas of their own lines.
     | \{[\w:+-]+\}`[^`]*` | `[^`]*` | \$\$.*?\$\$
