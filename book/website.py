@@ -19,9 +19,12 @@ import reliability
 from chapters import Notebook, tree_hash
 from experiments.files import replace_text
 from experiments.orphans import python
+from finish import finish
 from messages import BuildError, for_terminal
 
 NUM_SLOWEST_CELLS = 8
+NOT_STAGED = ("_build", "_executed", "__pycache__", "*.py", "finish", "locks", "rules")
+FINISHING = Path(__file__).parent / "finish"
 JUPYTER_BOOK = "from jupyter_book.cli.main import main; main()"
 
 
@@ -29,10 +32,12 @@ def build_site(root: Path, build: Path, notebooks: list[Notebook], profile: str)
     """Make <build>/html of the executed notebooks and the prose; False if it is up to date."""
     source, html, built_from = build / "source", build / "html", build / "html.sources"
     stage(root, source, notebooks, profile)
-    sources = tree_hash(source)
+    sources = f"{tree_hash(source)} {tree_hash(FINISHING)}"
     if built_from.exists() and built_from.read_text() == f"{sources} {tree_hash(html)}\n":
         return False
-    replace_folder(html, run_jupyter_book(source, build / "new"))
+    pages = run_jupyter_book(source, build / "new")
+    finish(pages)
+    replace_folder(html, pages)
     replace_text(built_from, f"{sources} {tree_hash(html)}\n")
     shutil.rmtree(build / "new")
     return True
@@ -41,7 +46,7 @@ def build_site(root: Path, build: Path, notebooks: list[Notebook], profile: str)
 def stage(root: Path, source: Path, notebooks: list[Notebook], profile: str) -> None:
     """Put all that enters the site into one folder: prose, executed notebooks, generated pages."""
     shutil.rmtree(source, ignore_errors=True)
-    others = shutil.ignore_patterns("_build", "_executed", "__pycache__", "*.py", "locks", "rules")
+    others = shutil.ignore_patterns(*NOT_STAGED)
     shutil.copytree(root / "book", source, ignore=others)
     for name in ("_config.yml", "_toc.yml", "environment.txt"):
         shutil.copy(root / name, source)

@@ -65,7 +65,7 @@ def bad_images(seen: Visit) -> list[dict]:
 
 
 def bad_equations(seen: Visit) -> list[str]:
-    """Mathematics that MathJax did not set, set twice, or set as an error."""
+    """Mathematics that was not set, set twice, or set as an error."""
     content = seen.content
     wrong = content["unrendered"] + content["math_errors"]
     if content["equations"] != content["math"]:
