@@ -10,10 +10,13 @@ from pathlib import Path
 
 import nbformat
 
+import archive
 import benchmarks
 import claims
 import costs
+import first_page
 import licences
+import printing
 import provenance
 import reliability
 from chapters import Notebook, tree_hash
@@ -37,6 +40,7 @@ def build_site(root: Path, build: Path, notebooks: list[Notebook], profile: str)
         return False
     pages = run_jupyter_book(source, build / "new")
     finish(pages)
+    printing.print_book(pages, root)
     replace_folder(html, pages)
     replace_text(built_from, f"{sources} {tree_hash(html)}\n")
     shutil.rmtree(build / "new")
@@ -57,13 +61,22 @@ def stage(root: Path, source: Path, notebooks: list[Notebook], profile: str) -> 
     for notebook in notebooks:
         nbformat.write(notebook.read_executed(), source / f"{notebook.name}.ipynb")
     claims.write_fragments(source)
+    first_page.write_fragments(source)
     provenance.write_fragment(source)
     reliability.write_fragment(source)
     benchmarks.write_fragment(source)
     costs.write_fragment(source)
     licences.write_fragment(source)
+    archive.write_archive(root, source / "extra" / archive.NAME)
+    (source / "_generated" / "source.md").write_text(downloads(root, source), encoding="utf-8")
     run_times = source / "_generated" / "run_times.md"
     run_times.write_text(run_times_tables(notebooks, profile), encoding="utf-8")
+
+
+def downloads(root: Path, source: Path) -> str:
+    """What the site offers of itself: its source, and the book on paper."""
+    whole = archive.where_to_find_it(root, source / "extra" / archive.NAME)
+    return whole + (printing.LINK if printing.chromium() else "")
 
 
 def run_jupyter_book(source: Path, output: Path) -> Path:

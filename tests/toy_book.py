@@ -8,6 +8,8 @@ from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
 
 import claims
 import costs
+import first_page
+import printing
 import provenance
 import sources
 
@@ -72,5 +74,6 @@ def in_toy(patch: pytest.MonkeyPatch, root: Path) -> None:
     """The toy's own package, and no claims."""
     patch.setattr(sources, "PACKAGES", {"ipo": root / "ipo"})
     patch.setattr(claims, "write_fragments", lambda folder: None)
-    for page in (provenance, costs):
+    patch.setattr(printing, "chromium", lambda: None)
+    for page in (provenance, costs, first_page):
         patch.setattr(page, "write_fragment", lambda folder: None)

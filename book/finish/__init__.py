@@ -10,6 +10,8 @@ from finish.access import make_accessible
 from finish.equations import set_equations
 from finish.icons import draw_icons
 from finish.lean import make_lean, remove_source_maps
+from finish.pictures import adapt_pictures
+from finish.tables import keep_intervals
 
 
 def finish(html: Path) -> None:
@@ -24,5 +26,7 @@ def finish(html: Path) -> None:
     draw_icons(pages, html)
     for name, page in pages.items():
         make_accessible(page)
+        adapt_pictures(page, html)
+        keep_intervals(page)
         make_lean(name, page)
         paths[name].write_text(str(page), encoding="utf-8")
