@@ -7,6 +7,7 @@ from pathlib import Path
 from bs4 import BeautifulSoup
 
 from finish.access import make_accessible
+from finish.downloads import add_downloads
 from finish.equations import set_equations
 from finish.icons import draw_icons
 from finish.lean import make_lean, remove_source_maps
@@ -28,5 +29,6 @@ def finish(html: Path) -> None:
         make_accessible(page)
         adapt_pictures(page, html)
         keep_intervals(page)
+        add_downloads(page)
         make_lean(name, page)
         paths[name].write_text(str(page), encoding="utf-8")

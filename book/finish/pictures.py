@@ -10,6 +10,7 @@ from bs4 import BeautifulSoup, Tag
 
 GREY = re.compile(r"#([0-9a-f]{2})\1\1\b")
 WIDTH = re.compile(r'<svg [^>]*?width="([\d.]+)pt"')
+BLACK = "#000000"
 DARKEST, LIGHTEST = 0x12, 0xE6  # of the theme in dark mode: its background, and its text
 NARROW = 340  # pixels of the text on a phone
 LEAST_PIXELS_PER_POINT = 0.68  # of a figure's width: letters of 11.5 pt are 8 pixels high then
@@ -23,7 +24,10 @@ def adapt_pictures(page: BeautifulSoup, html: Path) -> None:
         if "matplotlib" not in text:
             continue
         twin = path.with_suffix(".dark.svg")
-        twin.write_text(GREY.sub(mirrored, text), encoding="utf-8")
+        light = text.replace(
+            "<svg ", f'<svg fill="{BLACK}" ', 1
+        )  # of what names no colour: letters
+        twin.write_text(GREY.sub(mirrored, light), encoding="utf-8")
         add_twin(picture, f"{picture['src']}".replace(path.name, twin.name))
         if width := WIDTH.search(text):
             let_scroll(picture, LEAST_PIXELS_PER_POINT * float(width[1]), page)

@@ -106,6 +106,8 @@ class Compared:
         interval = f"[{low:+.{digits}f}, {high:+.{digits}f}]"
         chance = "p < 0.001" if p < 0.001 else f"p = {p:.3f}"
         found = f"{mean:+.{digits}f}, 95 % interval {interval}, {chance}"
+        if max(-low, high) < 0.5 * 10**-digits:  # then the digits say nothing
+            found = f"less than {10**-digits:g}, as at both ends of its 95 % interval, {chance}"
         if self.effect is None or not self.spread:
             return found
         power_there = power(self.effect, self.spread, self.num_runs)

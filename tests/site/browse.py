@@ -24,15 +24,18 @@ WIDE = {"width": 1440, "height": 900}
 PHONE = {"width": 390, "height": 844}
 
 # Everything that the tests want to know of a page, in one round trip.
-CONTENT = """() => {
+CONTENT = """async () => {
   const all = (selector) => [...document.querySelectorAll(selector)];
+  const pictures = all('img').filter(picture => picture.checkVisibility());
+  pictures.forEach(picture => { picture.loading = 'eager'; });  // the others are for another theme
+  await Promise.allSettled(pictures.map(picture => picture.decode()));
   // What is left of the TeX of an equation: the build takes away what it has set.
   const source = (math) => [...math.childNodes]
     .filter(node => node.nodeType === Node.TEXT_NODE).map(node => node.data).join('');
   return {
     links: all('a[href]').map(a => a.href),
     ids: all('[id]').map(e => e.id),
-    images: all('img').map(i => ({
+    images: pictures.map(i => ({
       source: i.getAttribute('src'), alt: i.alt, loaded: i.complete && i.naturalWidth > 0})),
     math: all('.math').length,
     unrendered: all('.math')
