@@ -24,9 +24,8 @@ def adapt_pictures(page: BeautifulSoup, html: Path) -> None:
         if "matplotlib" not in text:
             continue
         twin = path.with_suffix(".dark.svg")
-        light = text.replace(
-            "<svg ", f'<svg fill="{BLACK}" ', 1
-        )  # of what names no colour: letters
+        # Letters name no colour: they have that of the whole.
+        light = text.replace("<svg ", f'<svg fill="{BLACK}" ', 1)
         twin.write_text(GREY.sub(mirrored, light), encoding="utf-8")
         add_twin(picture, f"{picture['src']}".replace(path.name, twin.name))
         if width := WIDTH.search(text):

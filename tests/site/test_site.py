@@ -151,9 +151,8 @@ def weight(seen: Visit, built_site) -> float:
     home = seen.url.rsplit("/", 1)[0]
     pictures = [f"{home}/{image['source']}" for image in seen.content["images"]]
     own = {urlsplit(url.removeprefix(home)).path.lstrip("/") for url in [*seen.requests, *pictures]}
-    total = sum(
-        len((built_site / name).read_bytes()) for name in own if (built_site / name).is_file()
-    )
+    files = [built_site / name for name in own if (built_site / name).is_file()]
+    total = sum(path.stat().st_size for path in files)
     page = (built_site / urlsplit(seen.url).path.rsplit("/", 1)[-1]).read_text(encoding="utf-8")
     return (total - sum(map(len, FILM.findall(page)))) / 1e6
 
