@@ -64,7 +64,7 @@ def draw_path(ax: Axes, path: np.ndarray, method: str, name: str, size: float = 
 
 def draw_text(ax: Axes, point: Point, text: str, shift: tuple[float, float]) -> None:
     """A small text beside a point."""
-    ax.annotate(text, point, xytext=shift, textcoords="offset points", fontsize="small")
+    ax.annotate(text, point, xytext=shift, textcoords="offset points", fontsize="x-small")
 
 
 def draw_references(ax: Axes, pooled: Point, optima: np.ndarray) -> None:
