@@ -159,13 +159,15 @@ def headlines(
 
 def headline(entry: dict, chapter: dict, cells: Cells, paper: pd.DataFrame) -> tuple[str, str, str]:
     """Label, the paper's number and ours; a dash where there is none."""
-    digits = chapter["digits"]
     try:
-        ours = f"{cells.runs(**chapter['measured'], **entry['cell']).mean():.{digits}f}"
+        ours = f"{cells.runs(**chapter['measured'], **entry['cell']).mean():{chapter['format']}}"
     except NoData:
         ours = "–"
-    theirs = Cells(paper, num_runs=1).select(**entry["paper"])
-    return entry["label"], f"{theirs['mean'].item():.{digits}f}" if entry["paper"] else "–", ours
+    theirs = "–"
+    if entry["paper"]:
+        mean = Cells(paper, num_runs=1).select(**entry["paper"])["mean"].item()
+        theirs = f"{mean:{chapter['format']}}"
+    return entry["label"], theirs, ours
 
 
 def tally(verdicts: list[str]) -> list[str]:

@@ -40,9 +40,15 @@ def line(title: str, parts: list) -> dict[str, str]:
     return {
         "Rows": title,
         "Batches": str(len(parts)),
-        "Core-hours": f"{sum(costs) / 3600:.2f}",
-        "Longest batch [min]": f"{max(costs) / 60:.1f}",
+        "Core-hours": at_least(sum(costs) / 3600, 2),
+        "Longest batch [min]": at_least(max(costs) / 60, 1),
     }
+
+
+def at_least(number: float, digits: int) -> str:
+    """A number, or a bound where rounding would leave nothing of it."""
+    least = 10**-digits
+    return f"{number:.{digits}f}" if number >= least / 2 else f"< {least:g}"
 
 
 def scaling(bench: dict) -> str:

@@ -10,21 +10,22 @@ from ast import literal_eval
 from base64 import b64decode
 from pathlib import Path
 
+from bs4 import BeautifulSoup
 from nbformat import NotebookNode
 from playwright.sync_api import sync_playwright
 
 from chapters import Notebook
 from experiments.orphans import python
+from finish.equations import set_equations
 from messages import BuildError, for_terminal
+from printing import chromium
 
 SPHINX = "import sys; from sphinx.cmd.build import main; sys.exit(main(sys.argv[1:]))"
 CONFIGURATION = """
 extensions = ["myst_parser", "sphinx.ext.mathjax", "sphinx_revealjs"]
 myst_enable_extensions = ["dollarmath"]
-mathjax_path = "../../mathjax/tex-svg-full.js"
-mathjax3_config = {"options": {"enableMenu": False}}
-revealjs_static_path = ["slides.css"]
-revealjs_css_files = ["slides.css"]
+revealjs_static_path = ["slides.css", "equations.css"]
+revealjs_css_files = ["slides.css", "equations.css"]
 revealjs_style_theme = "white"
 revealjs_script_conf = {
     "width": 1280, "height": 720, "hash": True, "slideNumber": True, "transition": "none",
@@ -44,20 +45,14 @@ ANSWER = re.compile(
 )
 
 
-def write_fragment(folder: Path, decks: list[str]) -> None:
-    """Writes ``_generated/slides.md`` under ``folder``: links to the slides of each chapter."""
+def links(decks: list[str]) -> str:
+    """A table of the slides of each chapter."""
     kinds = ["html", "pdf"] if chromium() else ["html"]
     lines = ["| chapter | slides |", "|:--|:--|"]
     for deck in decks:
-        links = ", ".join(f'<a href="slides/{deck}.{kind}">{KINDS[kind]}</a>' for kind in kinds)
-        lines.append(f"| {{doc}}`{deck}` | {links} |")
-    target = Path(folder) / "_generated"
-    target.mkdir(parents=True, exist_ok=True)
-    (target / "slides.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
-
-
-def chromium() -> str | None:
-    return shutil.which("chromium") or shutil.which("chromium-browser")
+        addresses = ", ".join(f'<a href="slides/{deck}.{kind}">{KINDS[kind]}</a>' for kind in kinds)
+        lines.append(f"| {{doc}}`{deck}` | {addresses} |")
+    return "\n".join(lines) + "\n"
 
 
 def decks_of(source: Path, notebooks: list[Notebook]) -> list[str]:
@@ -73,7 +68,8 @@ def build(source: Path, new: Path, html: Path, notebooks: list[Notebook]) -> Non
         return
     new.mkdir(parents=True)
     (new / "conf.py").write_text(CONFIGURATION, encoding="utf-8")
-    shutil.copy(source / "slides" / "slides.css", new)
+    for style in (source / "slides" / "slides.css", source / "_static" / "equations.css"):
+        shutil.copy(style, new)
     contents = ["# Slides", "", "```{toctree}", *decks, "```"]
     (new / "index.md").write_text("\n".join(contents), encoding="utf-8")
     for notebook in notebooks:
@@ -82,6 +78,7 @@ def build(source: Path, new: Path, html: Path, notebooks: list[Notebook]) -> Non
             filled = Filler(notebook.read_executed(), new).fill(deck)
             (new / f"{notebook.name}.md").write_text(filled, encoding="utf-8")
     run_sphinx(new, html / "slides")
+    set_equations_of(html / "slides")
     print_all(html / "slides", decks)
 
 
@@ -176,6 +173,18 @@ def run_sphinx(source: Path, target: Path) -> None:
         shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
 
 
+def set_equations_of(folder: Path) -> None:
+    """As on the pages of the book: there is no script for them."""
+    paths = {path.name: path for path in folder.glob("*.html")}
+    pages = {
+        name: BeautifulSoup(path.read_text(encoding="utf-8"), "html.parser")
+        for name, path in paths.items()
+    }
+    set_equations(pages)
+    for name, page in pages.items():
+        paths[name].write_text(str(page), encoding="utf-8")
+
+
 def print_all(folder: Path, decks: list[str]) -> None:
     """A PDF of each deck, one page for each slide; without Chromium there is none."""
     if not chromium():
@@ -187,7 +196,6 @@ def print_all(folder: Path, decks: list[str]) -> None:
         page = browser.new_page()
         for deck in decks:
             page.goto(f"{(folder / deck).resolve().as_uri()}.html?print-pdf", wait_until="load")
-            page.evaluate("() => window.MathJax?.startup?.promise")
             page.wait_for_selector(".pdf-page")
             page.pdf(path=folder / f"{deck}.pdf", prefer_css_page_size=True, print_background=True)
         browser.close()

@@ -26,10 +26,10 @@ def overview() -> str:
 
 
 def mathjax() -> str:
-    folder = ROOT / "book" / "extra" / "mathjax"
+    folder = ROOT / "book" / "finish" / "mathjax"
     title = (folder / "VERSION.md").read_text(encoding="utf-8").splitlines()[0]
     terms = (folder / "LICENSE").read_text(encoding="utf-8").split("\n\n")[0]
-    return f"| {title.lstrip('# ')} | `book/extra/mathjax` | {' '.join(terms.split())} |"
+    return f"| {title.lstrip('# ')} | `book/finish/mathjax` | {' '.join(terms.split())} |"
 
 
 def notice(package: str, name: str) -> str:

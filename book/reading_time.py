@@ -8,6 +8,7 @@ from pathlib import Path
 from nbformat import NotebookNode
 
 from chapters import Notebook
+from fragments import write_fragment
 
 WORDS_PER_MINUTE = 220
 # Blocks of code and of equations, whose time no count of words can say, and lines of directives.
@@ -17,8 +18,6 @@ INLINE = re.compile(r"\$[^$]+\$|\{[\w:+-]+\}`[^`]*`|`[^`]*`")  # read as one wor
 
 def write_fragments(folder: Path, notebooks: list[Notebook]) -> None:
     """Writes ``_generated/times/`` under ``folder``: a line for each chapter, a table of all."""
-    target = Path(folder) / "_generated" / "times"
-    target.mkdir(parents=True, exist_ok=True)
     table = ["| chapter | words | minutes to read | seconds to run |", "|:--|--:|--:|--:|"]
     for notebook in notebooks:
         words, seconds = count_words(notebook.read()), notebook.read_record()["seconds"]
@@ -27,10 +26,10 @@ def write_fragments(folder: Path, notebooks: list[Notebook]) -> None:
             "equations and exercises); "
             f"its notebook ran in {seconds:.0f} seconds when this site was built.\n"
         )
-        (target / f"{notebook.name}.md").write_text(line, encoding="utf-8")
+        write_fragment(folder, f"times/{notebook.name}", line)
         row = [f"{{doc}}`{notebook.name}`", f"{words:,}", f"{minutes(words)}", f"{seconds:.0f}"]
         table.append(f"| {' | '.join(row)} |")
-    (target / "all.md").write_text("\n".join(table) + "\n", encoding="utf-8")
+    write_fragment(folder, "times/all", "\n".join(table) + "\n")
 
 
 def count_words(notebook: NotebookNode) -> int:

@@ -10,14 +10,17 @@ from pathlib import Path
 
 import nbformat
 
+import archive
 import benchmarks
 import claims
 import costs
 import decks
 import deviations
 import fairness
+import first_page
 import hyperparameters
 import licences
+import printing
 import provenance
 import reading_time
 import reliability
@@ -25,6 +28,7 @@ import teaching
 from chapters import Notebook, tree_hash
 from experiments.files import replace_text
 from experiments.orphans import python
+from finish import finish
 from fragments import write_fragment
 from messages import BuildError, for_terminal
 
@@ -36,6 +40,8 @@ GENERATED = {  # text from what is recorded, and from the packages that are inst
     "licences": licences,
 }
 NUM_SLOWEST_CELLS = 8
+NOT_STAGED = ("_build", "_executed", "__pycache__", "*.py", "finish", "locks", "rules")
+FINISHING = Path(__file__).parent / "finish"
 JUPYTER_BOOK = "from jupyter_book.cli.main import main; main()"
 
 
@@ -43,11 +49,13 @@ def build_site(root: Path, build: Path, notebooks: list[Notebook], profile: str)
     """Make <build>/html of the executed notebooks and the prose; False if it is up to date."""
     source, html, built_from = build / "source", build / "html", build / "html.sources"
     stage(root, source, notebooks, profile)
-    sources = tree_hash(source)
+    sources = f"{tree_hash(source)} {tree_hash(FINISHING)}"
     if built_from.exists() and built_from.read_text() == f"{sources} {tree_hash(html)}\n":
         return False
     pages = run_jupyter_book(source, build / "new")
     decks.build(source, build / "new" / "slides", pages, notebooks)
+    finish(pages)
+    printing.print_book(pages, root)
     replace_folder(html, pages)
     replace_text(built_from, f"{sources} {tree_hash(html)}\n")
     shutil.rmtree(build / "new")
@@ -57,7 +65,7 @@ def build_site(root: Path, build: Path, notebooks: list[Notebook], profile: str)
 def stage(root: Path, source: Path, notebooks: list[Notebook], profile: str) -> None:
     """Put all that enters the site into one folder: prose, executed notebooks, generated pages."""
     shutil.rmtree(source, ignore_errors=True)
-    others = shutil.ignore_patterns("_build", "_executed", "__pycache__", "*.py", "locks", "rules")
+    others = shutil.ignore_patterns(*NOT_STAGED)
     shutil.copytree(root / "book", source, ignore=others)
     for name in ("_config.yml", "_toc.yml", "environment.txt"):
         shutil.copy(root / name, source)
@@ -70,17 +78,26 @@ def stage(root: Path, source: Path, notebooks: list[Notebook], profile: str) -> 
     claims.write_fragments(source)
     for name, page in GENERATED.items():
         write_fragment(source, name, page.overview())
+    archive.write_archive(root, source / "extra" / archive.NAME)
     tables = {
         "fairness": fairness.table(),
         "hyperparameters": hyperparameters.tables(),
         "deviations": deviations.tables(),
+        "slides": decks.links(decks.decks_of(source, notebooks)),
+        "source": downloads(root, source),
         "run_times": run_times_tables(notebooks, profile),
     }
     for name, text in tables.items():
         write_fragment(source, name, text)
     reading_time.write_fragments(source, notebooks)
-    decks.write_fragment(source, decks.decks_of(source, notebooks))
     teaching.write_download(source, source.parent)
+    first_page.write_fragments(source)
+
+
+def downloads(root: Path, source: Path) -> str:
+    """What the site offers of itself: its source, and the book on paper."""
+    whole = archive.where_to_find_it(root, source / "extra" / archive.NAME)
+    return whole + (printing.LINK if printing.chromium() else "")
 
 
 def run_jupyter_book(source: Path, output: Path) -> Path:

@@ -8,6 +8,8 @@ from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
 
 import claims
 import costs
+import first_page
+import printing
 import provenance
 import sources
 import teaching
@@ -74,5 +76,7 @@ def in_toy(patch: pytest.MonkeyPatch, root: Path) -> None:
     patch.setattr(sources, "PACKAGES", {"ipo": root / "ipo"})
     patch.setattr(claims, "write_fragments", lambda folder: None)
     patch.setattr(teaching, "write_download", lambda source, build: None)
+    patch.setattr(printing, "chromium", lambda: None)
+    patch.setattr(first_page, "write_fragments", lambda folder: None)
     for page in (provenance, costs):
         patch.setattr(page, "overview", lambda: "")

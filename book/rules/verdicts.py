@@ -106,6 +106,8 @@ class Compared:
         digits = 1 if self.spread > 1 else 3
         chance = "p < 0.001" if p < 0.001 else f"p = {p:.3f}"
         found = f"{with_interval(mean, low, high, digits)}, {chance}"
+        if max(-low, high) < 0.5 * 10**-digits:  # then the digits say nothing
+            found = f"less than {10**-digits:g}, as at both ends of its 95 % interval, {chance}"
         if self.effect is None or not self.spread:
             return found
         theirs = shown(self.effect, f"+.{digits}f")

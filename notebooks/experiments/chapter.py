@@ -9,7 +9,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import matplotlib.pyplot as plt
 import pandas as pd
 import torch
 from myst_nb import glue
@@ -44,7 +43,7 @@ class Chapter:
         results_dir: str | None,
         num_workers: Count | None = None,
     ) -> None:
-        plt.rcParams.update(figures.STYLE)
+        figures.set_up()
         torch.set_num_threads(1)  # small matrices: processes use the cores better than threads
         self.name, self.experiments = name, experiments
         self._scratch = tempfile.TemporaryDirectory()

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
 
 import matplotlib.colors
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
+from IPython import get_ipython
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib_inline.config import InlineBackend
 
 from ipo.causality.scm import SCM
 from ipo.networks import Network
@@ -38,15 +42,21 @@ STYLES = {
 # Where two methods are compared problem by problem; the same order in legends and tables.
 OUTCOMES = {
     "IPO better": "#0072B2",
-    "tie": "#BBBBBB",
+    "tie": "#B8BBC0",
     "IPO worse": "#D55E00",
-    "both unstable": "#333333",
+    "both unstable": "#30343A",
 }
 
+# Letters are large for the printed size: a page shows a figure smaller than it is drawn.
 STYLE = {
     "figure.dpi": 110,
     "savefig.dpi": 160,
-    "font.size": 10,
+    "font.size": 11.5,
+    "xtick.labelsize": 10.5,
+    "ytick.labelsize": 10.5,
+    "legend.fontsize": 10.5,
+    "axes.titlesize": 11.5,
+    "svg.hashsalt": "ipo",  # the same figure is the same file
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.grid": True,
@@ -55,6 +65,15 @@ STYLE = {
     "figure.constrained_layout.use": True,
     "figure.facecolor": "white",
 }
+
+
+def set_up() -> None:
+    """The book's style; in a notebook, figures are vectors, which any screen shows sharply."""
+    plt.rcParams.update(STYLE)
+    if shell := get_ipython():
+        backend = InlineBackend.instance(parent=shell)
+        backend.figure_formats = {"svg"}
+        backend.print_figure_kwargs = {"bbox_inches": "tight", "metadata": {"Date": None}}
 
 
 def label(method: str) -> str:
@@ -191,7 +210,7 @@ def draw_network(ax: Axes, network: Network) -> None:
         shape = network.shapes.get(name)
         text = f"{name}\n{shape[0]} → {shape[1]}" if shape else name
         ax.text(
-            x, y, text, ha="center", va="center", fontsize=9,
+            x, y, text, ha="center", va="center", fontsize="medium",
             bbox={"boxstyle": "round,pad=0.4", "facecolor": "white", "edgecolor": color, "lw": 1.5},
         )  # fmt: skip
     columns = [x for x, _ in nodes.values()]
@@ -253,6 +272,42 @@ def draw_optimizers(ax: Axes, points: pd.DataFrame, x: str, y: str) -> None:
         ax.scatter(runs[x], runs[y], label=name + suffix, **look)
 
 
+class Advantage(NamedTuple):
+    """How much better one method is than another, with its 95 % interval; the paper's is 1."""
+
+    label: str
+    mean: float
+    low: float
+    high: float
+
+
+def draw_advantages(rows: Sequence[Advantage]) -> Figure:
+    """Advantages below each other, beside none and the paper's: as wide as a phone is."""
+    with plt.rc_context(STYLE):
+        fig, ax = plt.subplots(figsize=(6.4, 0.36 * len(rows) + 0.8))
+    for place, row in enumerate(reversed(rows)):
+        ax.plot([row.low, row.high], [place, place], color="#0072B2", lw=3, alpha=0.45)
+        ax.plot(row.mean, place, color="#0072B2", marker="o", ms=8)
+    ax.axvline(0, color="0.35", lw=1)
+    ax.axvline(1, color="0.35", lw=1, ls="--")
+    ax.set_yticks(range(len(rows)), [row.label for row in reversed(rows)])
+    ax.set_ylim(-0.6, len(rows) - 0.4)
+    top = ax.secondary_xaxis("top")
+    top.set_xticks([0, 1], ["none", "the paper's"])
+    top.tick_params(length=0)
+    top.spines["top"].set_visible(False)
+    ax.set_xlabel("advantage of IPO, in multiples of the paper's")
+    ax.grid(axis="y", visible=False)
+    return fig
+
+
+def save(fig: Figure, path: Path) -> None:
+    """The same figure gives the same file."""
+    with plt.rc_context(STYLE):
+        fig.savefig(path, metadata={"Date": None}, bbox_inches="tight")
+    plt.close(fig)
+
+
 def causal_graph(
     ax: Axes,
     model: SCM,
@@ -303,7 +358,7 @@ def interval_lines(
 
 
 def write_numbers(
-    ax: Axes, cells: np.ndarray, light: np.ndarray, form: str = "{}", fontsize: int = 8
+    ax: Axes, cells: np.ndarray, light: np.ndarray, form: str = "{}", fontsize: str = "small"
 ) -> None:
     """The numbers of a picture ``[rows, columns]`` in its cells, white where it is dark.
 
@@ -320,11 +375,11 @@ def agents_view(picture: np.ndarray, image: np.ndarray) -> Figure:
     """A grid, and the three channels of MiniGrid's ``image [7, 7, 3]`` that is seen of it."""
     fig, axes = plt.subplots(1, 4, figsize=(10, 2.9))
     axes[0].imshow(picture)
-    axes[0].set_title("grid, view highlighted", fontsize=10)
+    axes[0].set_title("grid, view highlighted", fontsize="medium")
     for ax, codes, name in zip(axes[1:], image.T, ("object", "colour", "state"), strict=True):
         ax.imshow(codes, cmap="viridis", vmin=0, vmax=10)
-        write_numbers(ax, codes, light=codes < 7, fontsize=7)
-        ax.set_title(name, fontsize=10)
+        write_numbers(ax, codes, light=codes < 7, fontsize="small")
+        ax.set_title(name, fontsize="medium")
     for ax in axes:
         ax.axis("off")
     return fig
@@ -345,7 +400,7 @@ def time_in_cells(panels: Mapping[str, np.ndarray], phases: Sequence[str]) -> Fi
     fig, axes = plt.subplots(len(phases), len(panels), figsize=(9, 6.6), sharex=True, sharey=True)
     top = max(grid.max() for grid in panels.values())
     for column, (title, grid) in zip(axes.T, panels.items(), strict=True):
-        column[0].set_title(f"{title}: {grid.sum():.1f} steps", fontsize=10)
+        column[0].set_title(f"{title}: {grid.sum():.1f} steps", fontsize="medium")
         for ax, cells in zip(column, grid, strict=True):
             ax.set_facecolor("0.93")
             visited = np.where(cells > 0, cells, np.nan)
@@ -383,7 +438,7 @@ def draw_selected(ax: Axes, data: pd.DataFrame, x: str, y: str, kept: str) -> No
     slope, start = np.polyfit(*data[data[kept] == 1][[x, y]].to_numpy().T, 1)
     line = np.array([-1.5, 3])
     ax.plot(line, start + slope * line, color="black", label="fit to the successful")
-    ax.legend(loc="lower left", fontsize=8)
+    ax.legend(loc="lower left", fontsize="small")
 
 
 def errors_by_strength(errors: Mapping[str, pd.DataFrame]) -> Figure:
@@ -406,10 +461,10 @@ def colored_digits(domains: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> Figu
         for ax, features, label in zip(row, x, y, strict=False):
             inks = features[:128].reshape(2, 8, 8, 1) * (1 - np.array([[[orange]], [[blue]]]))
             ax.imshow(1 - inks.sum(0))
-            ax.set_title(f"y = {label:.0f}", fontsize=8)
+            ax.set_title(f"y = {label:.0f}", fontsize="small")
             ax.set(xticks=[], yticks=[])
             ax.grid(False)
-        row[0].set_ylabel(name, fontsize=8)
+        row[0].set_ylabel(name, fontsize="small")
     return fig
 
 
@@ -420,7 +475,7 @@ def errors_by_level(
     fig, ax = plt.subplots(figsize=(6.5, 3.8))
     interval_lines(ax, rows, "test_risk", "level", methods, baseline=1.0)
     ax.set(xlabel=xlabel, ylabel="mean squared error, test domain", ylim=(0, None))
-    ax.legend(fontsize=8, ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1))
+    ax.legend(fontsize="small", ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1))
     if ticks:
         ax.set_xscale("log")
         ax.set_xticks(ticks, ticks)
@@ -438,5 +493,5 @@ def errors_by_penalty(rows: pd.DataFrame, oracle: float) -> Figure:
         ax.set(xscale="log", title=label(method), xlabel="weight of the penalty λ", ylim=(0, 1))
     axes[0].set_ylabel("share of wrong labels")
     lines = ["test domain", "held out, training domains", "grey images, test domain"]
-    axes[0].legend(axes[0].get_lines(), lines, fontsize=8)
+    axes[0].legend(axes[0].get_lines(), lines, fontsize="small")
     return fig

@@ -60,7 +60,7 @@ def film_strip(
             ax.axis("off")
         for ax, step in zip(line, steps, strict=False):
             ax.imshow(frames[step])
-            ax.set_title(f"step {step * steps_per_frame}", fontsize=8)
+            ax.set_title(f"step {step * steps_per_frame}", fontsize="small")
         line[0].text(
             -0.12, 0.5, title, transform=line[0].transAxes, rotation=90, ha="center", va="center"
         )
@@ -76,7 +76,7 @@ def titled(
         ax.axis("off")
     for ax, (title, picture) in zip(axes.flat, pictures, strict=False):
         ax.imshow(picture)
-        ax.set_title(title, fontsize=9)
+        ax.set_title(title, fontsize="medium")
     return fig
 
 
@@ -93,25 +93,42 @@ def side_by_side(episodes: Sequence[Sequence[np.ndarray]], gap: int = 8) -> list
 
 def film_address(frames: Sequence[np.ndarray], fps: float) -> str:
     """A film as the address of a video."""
-    even = [np.pad(f, ((0, f.shape[0] % 2), (0, f.shape[1] % 2), (0, 0)), "edge") for f in frames]
     with TemporaryDirectory() as folder:
         path = Path(folder) / "film.mp4"
-        iio.imwrite(path, np.stack(even), fps=fps, codec="libx264", macro_block_size=2)
+        iio.imwrite(path, _even(frames), fps=fps, codec="libx264", macro_block_size=2)
         return f"data:video/mp4;base64,{base64.b64encode(path.read_bytes()).decode()}"
 
 
 def video(frames: Sequence[np.ndarray], caption: str, fps: int = 4) -> str:
-    """HTML of a film inside the page, with its last frame as poster and a caption."""
-    picture = io.BytesIO()
-    iio.imwrite(picture, frames[-1], extension=".png")
-    poster = base64.b64encode(picture.getvalue()).decode()
-    text = html.escape(caption)
+    """HTML of a film inside the page: its last frame as poster, a strip for print, a caption."""
+    even, text = _even(frames), html.escape(caption)
     return (
         f'<div class="film"><video controls loop muted playsinline aria-label="{text}" '
-        f'width="100%" poster="data:image/png;base64,{poster}">'
+        f'width="100%" poster="{address(even[-1])}">'
         f'<source type="video/mp4" src="{film_address(frames, fps)}"></video>'
+        f'<img class="strip" src="{address(strip(even))}" alt="Frames of the film: {text}">'
         f"<p>{text}</p></div>"
     )
+
+
+def _even(frames: Sequence[np.ndarray]) -> np.ndarray:
+    """Frames whose sides are even, as the codec wants them."""
+    height, width, _ = frames[0].shape
+    return np.stack([np.pad(f, ((0, height % 2), (0, width % 2), (0, 0)), "edge") for f in frames])
+
+
+def strip(frames: Sequence[np.ndarray], width: int = 1400) -> np.ndarray:
+    """Evenly spaced frames side by side, as many as fit, in half the size."""
+    num_frames = max(2, width * 2 // frames[0].shape[1])
+    chosen = np.linspace(0, len(frames) - 1, min(num_frames, len(frames))).round().astype(int)
+    return side_by_side([[frames[step][::2, ::2]] for step in chosen])[0]
+
+
+def address(picture: np.ndarray) -> str:
+    """A picture as an address that has all of it; WebP, a fifth of PNG's size."""
+    file = io.BytesIO()
+    iio.imwrite(file, picture, extension=".webp", quality=80)
+    return f"data:image/webp;base64,{base64.b64encode(file.getvalue()).decode()}"
 
 
 class DoorPicture:

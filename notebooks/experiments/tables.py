@@ -28,10 +28,18 @@ Values = Annotated[pd.Series, _check_values]  # of runs; infinite ones are told 
 
 @checked
 def show(frame: pd.DataFrame, formats: dict[str, str] | str | None = None) -> Styler:
-    """A table without its index; ``formats`` of its numbers, by column."""
+    """A table without its index; ``formats`` of its numbers, by column; ``p`` is a p value."""
     for column in formats if isinstance(formats, dict) else ():
         check_choice("formats", column, frame.columns)
-    return frame.style.format(formats).hide().set_table_attributes('class="dataframe"')
+    style = frame.style.format(formats)
+    if "p" in frame.columns:
+        style = style.format(_p_value, subset=["p"])
+    return style.hide().set_table_attributes('class="dataframe"')
+
+
+def _p_value(p: float) -> str:
+    """Three decimals, or that it is smaller."""
+    return "< 0.001" if p < 0.001 else f"{p:.3f}"
 
 
 @checked

@@ -4,10 +4,14 @@ screen, in light and dark mode."""
 from __future__ import annotations
 
 import re
+import zipfile
 from urllib.parse import urldefrag, urlsplit
 
 import pytest
 from browse import PHONE, Visit, new_context, open_page, visit
+
+import archive
+import printing
 
 # Contrast of every piece of visible text with the background that it stands on (WCAG 2).
 TEXT_CONTRAST = """() => {
@@ -32,6 +36,8 @@ TEXT_CONTRAST = """() => {
     });
 }"""
 READABLE = 4.5  # WCAG AA for text
+FIRST_PAGE_MB, CHAPTER_MB, PDF_MB = 1, 3, 30
+FILM = re.compile(r"data:video/mp4;base64,[A-Za-z0-9+/=]*")
 
 
 def anchors(visits: dict[str, Visit]) -> set[tuple[str, str]]:
@@ -65,7 +71,7 @@ def bad_images(seen: Visit) -> list[dict]:
 
 
 def bad_equations(seen: Visit) -> list[str]:
-    """Mathematics that MathJax did not set, set twice, or set as an error."""
+    """Mathematics that was not set, set twice, or set as an error."""
     content = seen.content
     wrong = content["unrendered"] + content["math_errors"]
     if content["equations"] != content["math"]:
@@ -137,6 +143,49 @@ def test_no_page_scrolls_sideways_on_a_phone(phone_visits):
     assert {name: width for name, width in widths.items() if width > PHONE["width"]} == {}
 
 
+# --- weight -------------------------------------------------------------------------------------
+
+
+def weight(seen: Visit, built_site) -> float:
+    """MB that a reader loads of a page: all of it but the films, which wait to be played."""
+    home = seen.url.rsplit("/", 1)[0]
+    pictures = [f"{home}/{image['source']}" for image in seen.content["images"]]
+    own = {urlsplit(url.removeprefix(home)).path.lstrip("/") for url in [*seen.requests, *pictures]}
+    files = [built_site / name for name in own if (built_site / name).is_file()]
+    total = sum(path.stat().st_size for path in files)
+    page = (built_site / urlsplit(seen.url).path.rsplit("/", 1)[-1]).read_text(encoding="utf-8")
+    return (total - sum(map(len, FILM.findall(page)))) / 1e6
+
+
+def test_no_page_is_heavy(visits, built_site):
+    weights = {name: weight(seen, built_site) for name, seen in visits.items()}
+    assert weights["intro.html"] < FIRST_PAGE_MB
+    assert {name: mb for name, mb in weights.items() if mb >= CHAPTER_MB} == {}
+
+
+def test_nothing_is_shipped_that_no_page_uses(built_site):
+    assert not list(built_site.rglob("*.map"))
+    assert not list(built_site.rglob("fontawesome.js"))
+
+
+# --- downloads -----------------------------------------------------------------------------------
+
+
+def test_the_source_of_the_book_is_offered_without_solutions(built_site):
+    with zipfile.ZipFile(built_site / archive.NAME) as source:
+        names = {name.removeprefix(f"{archive.INSIDE}/") for name in source.namelist()}
+        words = source.read(f"{archive.INSIDE}/Makefile").decode()
+    assert "make book" in words or "book:" in words
+    assert {"README.md", "environment.txt", "book/build.py", "notebooks/lqr.ipynb"} <= names
+    assert not [name for name in names if name.startswith(archive.SOLUTIONS)]
+
+
+def test_the_whole_book_is_one_pdf(browser, built_site):  # browser: there is a Chromium
+    printed = (built_site / printing.NAME).read_bytes()
+    assert printed.startswith(b"%PDF")
+    assert 0.5e6 < len(printed) < PDF_MB * 1e6
+
+
 # --- finding and reading -------------------------------------------------------------------------
 
 
@@ -192,18 +241,19 @@ def test_text_is_readable_in_both_modes(browser, built_site, page_names, mode):
         assert {name: texts for name, texts in faint.items() if texts} == {}
 
 
-def test_dark_mode_is_dark_and_figures_stand_on_white(browser, built_site):
+def test_dark_mode_is_dark_and_figures_are_drawn_for_it(browser, built_site):
     with new_context(browser) as context:
         page = context.new_page()
         open_page(page, f"{built_site.as_uri()}/lqr.html")
         switch_to(page, "dark")
         background = page.evaluate("getComputedStyle(document.body).backgroundColor")
         assert max(int(part) for part in re.findall(r"\d+", background)) < 64
-        cards = page.eval_on_selector_all(
-            ".bd-article figure img", "all => all.map(i => getComputedStyle(i).backgroundColor)"
+        shown = page.eval_on_selector_all(
+            ".bd-article .picture img",
+            "all => all.filter(i => i.checkVisibility()).map(i => i.getAttribute('src'))",
         )
-        assert cards
-        assert set(cards) == {"rgb(255, 255, 255)"}
+        assert shown
+        assert all(source.endswith(".dark.svg") for source in shown)
 
 
 def test_paper_gets_the_article_alone(browser, built_site):

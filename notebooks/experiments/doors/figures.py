@@ -115,7 +115,7 @@ def strategy_sheet(
         line[0].text(
             -0.06, 0.5,
             f"{row['strategy']}\n{row['value']:.0%} inside\n{row['method'].upper()} {row['run']}",
-            transform=line[0].transAxes, ha="right", va="center", fontsize=8,
+            transform=line[0].transAxes, ha="right", va="center", fontsize="small",
         )  # fmt: skip
     fig.get_layout_engine().set(w_pad=0.01, h_pad=0.01, wspace=0, hspace=0)
     return fig
@@ -199,14 +199,14 @@ def torque(doors: pd.DataFrame, by_hand: pd.Series) -> Figure:
     for friction, shade in zip((1.1, 1.5, 2.0), ("#56B4E9", "#0072B2", "black"), strict=True):
         left.axvline(friction / GEAR, color=shade, label=f"{friction} N m / {GEAR:g} N")
     left.set(xlabel="lever arm [m]", ylabel="doors")
-    left.legend(title="needed", fontsize=8)
+    left.legend(title="needed", fontsize="small")
     grid = np.linspace(0, 3, 200)
     enough = [(doors["lever"] * GEAR > friction).mean() for friction in grid]
     right.plot(grid, enough, color="0.5", label="one motor is strong enough")
     right.plot(by_hand.index, by_hand, color="black", marker="o", ms=4, label="controller by hand")
     right.axvspan(min(TEST_FRICTIONS), max(TEST_FRICTIONS), color="0.93", zorder=0)
     right.set(xlabel="friction [N m]", ylabel="part of the doors")
-    right.legend(fontsize=8)
+    right.legend(fontsize="small")
     return fig
 
 
@@ -228,7 +228,7 @@ def every_run(
             method, place = arms[arm].trained.label, list(arms).index(arm) - 0.35
             point = paper[(paper["method"] == method) & (paper["domain"] == str(f))]
             ax.scatter(place, 100 * point["mean"], s=60, facecolors="none", edgecolors="0.35")
-        ax.set_title(f"friction {f}", fontsize=10)
+        ax.set_title(f"friction {f}", fontsize="medium")
         ax.tick_params(axis="x", labelsize=7, rotation=90)
     axes[0, 0].set_ylabel("doors opened [%]")
     return fig
@@ -248,7 +248,7 @@ def power(gaps: np.ndarray, tested: Sequence[float], paper: pd.DataFrame) -> Fig
     ax.plot(tested, theirs, "o", mfc="none", mec="0.3", ms=8, label="paper")
     ax.axhline(0, color="0.6", lw=1)
     ax.set(xlabel="friction", ylabel="IPO − PPO [points]", xticks=tested)
-    ax.legend(fontsize=8, ncols=2)
+    ax.legend(fontsize="small", ncols=2)
     return fig
 
 
@@ -278,7 +278,7 @@ def robustness(
         xlabel=f"part of the pull by the hook's inside, friction {hard}",
         ylabel=f"opened at {hardest} [%]",
     )
-    left.legend(fontsize=8)
+    left.legend(fontsize="small")
     for column, kind in enumerate(STRATEGIES):
         opened = doors[doors["strategy"] == kind]["hard"]
         by_policy = 100 * opened.groupby(["method", "steps", "run"]).mean()
@@ -309,7 +309,7 @@ def learning(curves: pd.DataFrame) -> Figure:
         ax.set(title=title, xlabel="million steps")
     for ax in axes[1:]:
         ax.set_ylim(0, 1.02)
-    axes[2].legend(fontsize=8, loc="lower right")
+    axes[2].legend(fontsize="small", loc="lower right")
     return fig
 
 
@@ -330,9 +330,9 @@ def levers(
         rho = trait_correlations(success, doors, cell, hardest)
         right.barh(place + shift, rho, 0.38, color=color(cell), label=NAMES[arm])
     left.set(xlabel="lever arm [m]", ylabel="doors opened [%]")
-    left.legend(fontsize=8)
-    right.set_yticks(place, TRAITS.values(), fontsize=8)
+    left.legend(fontsize="small")
+    right.set_yticks(place, TRAITS.values(), fontsize="small")
     right.invert_yaxis()
     right.set_xlabel(f"rank correlation with success at {hardest}")
-    right.legend(fontsize=8)
+    right.legend(fontsize="small")
     return fig

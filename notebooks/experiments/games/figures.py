@@ -34,7 +34,7 @@ def field(games: Mapping[tuple[float | None, str], tuple[Point, Sequence[np.ndar
         draw_two_players(ax, wishes, bound, paths, limit=3.2)
         ax.set_title(f"{name}, {'no bound' if bound is None else f'bound {bound:g}'}")
     label_outside(axes, "spurious weight of player 1, $u$", "spurious weight of player 2, $v$")
-    axes[0, 0].legend(loc="lower left", fontsize=8, frameon=True)
+    axes[0, 0].legend(loc="lower left", fontsize="small", frameon=True)
     return fig
 
 
@@ -54,7 +54,7 @@ def draw_path(ax: Axes, path: np.ndarray, method: str, name: str, size: float = 
 
 def draw_text(ax: Axes, point: Point, text: str, shift: tuple[float, float]) -> None:
     """A small text beside a point."""
-    ax.annotate(text, point, xytext=shift, textcoords="offset points", fontsize=8)
+    ax.annotate(text, point, xytext=shift, textcoords="offset points", fontsize="x-small")
 
 
 def draw_references(ax: Axes, pooled: Point, optima: np.ndarray) -> None:
@@ -106,11 +106,11 @@ def players(rows: pd.DataFrame, growth: pd.DataFrame) -> Figure:
     left.set(xlabel="update", ylabel="distance in weight space")
     names = ("IPO, player from its start", "IPO, growth between players")
     texts = [names[0], "ensemble", names[1], "ensemble"]
-    left.legend(left.get_lines(), texts, fontsize=8)
+    left.legend(left.get_lines(), texts, fontsize="small")
     draw_metric(right, rows, "move_correlation", "update", methods)
     right.axhline(0, color="black", lw=1)
     right.set(xlabel="update", ylabel="correlation of what\nthe two players learnt", ylim=(-1, 1))
-    right.legend(fontsize=8)
+    right.legend(fontsize="small")
     return fig
 
 
@@ -135,7 +135,7 @@ def draw_keys_gaps(ax: Axes, lower: pd.Series, upper: pd.Series) -> None:
 def finish_gaps(axes: np.ndarray) -> None:
     """Scales, labels and legends that all panels with Nash gaps share."""
     for ax in axes.flat:
-        ax.legend(fontsize=8)
+        ax.legend(fontsize="small")
         ax.set_yscale("symlog", linthresh=1e-3)
         ax.set_ylim(0, None)
     label_outside(axes, "part of training", "Nash gap, relative")
