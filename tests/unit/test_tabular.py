@@ -21,15 +21,14 @@ from minigrid.envs import DynamicObstaclesEnv
 from experiments import tabulated
 from experiments.sealed import write_sealed
 from experiments.tabulated import TableWarning, load_or_tabulate
+from experiments.visits import occupancy, reach
 from ipo.worlds.colored_keys import COLORS, ColoredKeysEnv
 from ipo.worlds.tabular import (
     NotTabularError,
     TabularDomains,
     TabularTask,
     expected_return,
-    occupancy,
     optimal_policy,
-    reach,
     state_of,
     tabulate,
 )
