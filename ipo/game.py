@@ -18,19 +18,19 @@ Source: Algorithm 1 of Sonar, Pacelli and Majumdar (2021), after Ahuja et al. (2
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Annotated, NamedTuple
+from typing import Annotated, NamedTuple, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
 
 from ipo.checks import Count, Positive, check_count, checked, one_of
-from ipo.optimizers import descend
+from ipo.optimizers import Slope, step
 
 GAMES = ("pooled", "ipo", "ensemble", "in_turn")
 ORDERS = ("in_turn", "together")
 Order = Annotated[str, one_of(ORDERS)]
 
-Cost = Callable[[Tensor], Tensor]  # policy [R, ...] -> [R]
+Cost = Callable[[Tensor], Tensor]  # policy [R, ...] -> [R]; see also WithSlope
 BestCosts = Annotated[Tensor, "R E"] | Annotated[Tensor, "R 1"]
 
 
@@ -88,6 +88,24 @@ def average(players: Tensor) -> Tensor:
     pi_av = (1 / n_d) sum_d pi_d        (Section 4 of the paper)
     """
     return players.mean(dim=1)
+
+
+@runtime_checkable
+class WithSlope(Protocol):
+    """A cost that knows its gradient; that of any other is found by autograd."""
+
+    def slope(self, policy: Tensor, share: float) -> Slope:
+        """The cost ``[R]``, and ``share`` times its gradient in the policy."""
+
+
+def slope(cost: Cost, policy: Tensor, share: float = 1.0) -> Slope:
+    """A cost ``[R]`` and, as the only one, ``share`` times its gradient in the policy."""
+    if isinstance(cost, WithSlope):
+        return cost.slope(policy, share)
+    policy = policy.detach().requires_grad_()
+    costs = cost(policy)
+    # The runs do not interact: the gradient of their sum holds the gradient of each.
+    return costs.detach(), torch.autograd.grad(share * costs.sum(), policy)
 
 
 class LinearPlayers:
@@ -149,22 +167,24 @@ class LinearPlayers:
 
     def _move_in_turn(self, d: int, cost: Cost) -> None:
         """Player d steps; the average holds its new weights before the next player moves."""
-        player, share = self.players[d], 1 / len(self.players)
+        player, share = self.players[d].detach(), 1 / len(self.players)
+        first = slope(cost, self.policy, share)
         # In place, because it is large: what is left is the others' part.
-        self.policy.sub_(player.detach(), alpha=share)
-        self._step(d, lambda: cost(self.policy.add(player, alpha=share)))
-        self.policy.add_(player.detach(), alpha=share)
+        self.policy.sub_(player, alpha=share)
+        self._step(d, first, lambda: slope(cost, self.policy.add(player, alpha=share), share))
+        self.policy.add_(player, alpha=share)
 
     def _move_together(self, d: int, cost: Cost) -> None:
         """Player d steps; the average changes when the last has moved."""
-        player, share = self.players[d], 1 / len(self.players)
-        others = self.policy - share * player.detach()
-        self._step(d, lambda: cost(others + share * player))
+        player, share = self.players[d].detach(), 1 / len(self.players)
+        first = slope(cost, self.policy, share)
+        others = self.policy.sub(player, alpha=share)
+        self._step(d, first, lambda: slope(cost, others.add(player, alpha=share), share))
         if d == len(self.players) - 1:
             self.policy.copy_(average(self.weights))
 
-    def _step(self, d: int, objective: Callable[[], Tensor]) -> None:
-        descend(self.optimizers[d], objective, self.max_gradient_norm)
+    def _step(self, d: int, first: Slope, again: Callable[[], Slope]) -> None:
+        step(self.optimizers[d], first, again, self.max_gradient_norm)
         if self.bound is not None:
             self.players[d].detach().clamp_(-self.bound, self.bound)
 

@@ -185,33 +185,44 @@ def training_costs(K: Gains, problem: LQR) -> Tensor:
 
 def feedback_costs(F: Tensor, problem: LQR) -> Tensor:
     """The cost of ``a = -F s``, F ``[R, n_u, n_x]`` or ``[R, E, n_u, n_x]``; unchecked."""
-    systems = [problem.A, problem.B, problem.Q, problem.R]
-    if F.dim() == 4:
-        E = F.shape[1]
-        systems = [x.unsqueeze(1).expand(-1, E, -1, -1).flatten(0, 1) for x in systems]
-    return _StateFeedbackCost.apply(F.flatten(0, -3), *systems).unflatten(0, F.shape[:-2])
+    return _FeedbackCosts.apply(F, problem)
 
 
-class _StateFeedbackCost(torch.autograd.Function):
-    """``tr P`` of the state feedback ``a = -F s``, with its analytic gradient.
+def feedback_slopes(F: Tensor, problem: LQR, share: float = 1.0) -> tuple[Tensor, Tensor]:
+    """The same, and ``share`` times its gradient, of the shape of F, by hand.
 
         dJ/dF = 2 [R F - B'P M] S,    S = I + M S M'   (sum of the states' covariances)
 
     Source: Fazel et al. (2018), lemma 1.
     """
+    A, B, Q, R = (_beside(matrix, F) for matrix in (problem.A, problem.B, problem.Q, problem.R))
+    feedback = F.flatten(0, -3)
+    M = torch.baddbmm(A, B, feedback, alpha=-1)
+    RF = torch.bmm(R, feedback)
+    P, S = _lyapunov_pair(M, torch.baddbmm(Q, feedback.mT, RF))
+    slopes = torch.baddbmm(RF, B.mT, torch.bmm(P, M), alpha=-1).mul_(2 * share)
+    costs = P.diagonal(dim1=-2, dim2=-1).sum(-1)
+    return costs.view(F.shape[:-2]), torch.bmm(slopes, S).view_as(F)
+
+
+def _beside(matrix: Tensor, F: Tensor) -> Tensor:
+    """A matrix of each run, once for each of its systems."""
+    if F.dim() == 3:
+        return matrix
+    return matrix.unsqueeze(1).expand(-1, F.shape[1], -1, -1).flatten(0, 1)
+
+
+class _FeedbackCosts(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, F: Tensor, problem: LQR) -> Tensor:
+        costs, slopes = feedback_slopes(F, problem)
+        ctx.save_for_backward(slopes)
+        return costs
 
     @staticmethod
-    def forward(ctx: Any, F: Tensor, A: Tensor, B: Tensor, Q: Tensor, R: Tensor) -> Tensor:
-        M = torch.baddbmm(A, B, F, alpha=-1)
-        RF = torch.bmm(R, F)
-        P, S = _lyapunov_pair(M, torch.baddbmm(Q, F.mT, RF))
-        ctx.save_for_backward(torch.baddbmm(RF, B.mT, torch.bmm(P, M), alpha=-1), S)
-        return P.diagonal(dim1=-2, dim2=-1).sum(-1)
-
-    @staticmethod
-    def backward(ctx: Any, grad_cost: Tensor) -> tuple[Tensor, None, None, None, None]:
-        slope, S = ctx.saved_tensors
-        return torch.bmm(slope * (2 * grad_cost)[:, None, None], S), None, None, None, None
+    def backward(ctx: Any, grad_costs: Tensor) -> tuple[Tensor, None]:
+        (slopes,) = ctx.saved_tensors
+        return slopes * grad_costs[..., None, None], None
 
 
 def _lyapunov_pair(M: Tensor, C: Tensor) -> tuple[Tensor, Tensor]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import torch
@@ -27,8 +27,16 @@ from ipo.checks import (
     one_of,
 )
 from ipo.game import Cost, LinearPlayers, Order, play_round
-from ipo.lqr import LQR, Gains, feedback_costs, spectral_radius, split_domains, training_costs
-from ipo.optimizers import OPTIMIZERS, descend, make_optimizer
+from ipo.lqr import (
+    LQR,
+    Gains,
+    feedback_costs,
+    feedback_slopes,
+    spectral_radius,
+    split_domains,
+    training_costs,
+)
+from ipo.optimizers import OPTIMIZERS, Slope, descend, make_optimizer, step
 
 LQR_METHODS = ("gradient_descent", "overparameterized", "ipo_fixed_phi", "ipo_variable_phi")
 LQR_CONTROLS = ("in_turn", "ensemble")
@@ -99,19 +107,57 @@ class Learner:
     gain: Callable[[], Tensor]
 
 
+@dataclass(frozen=True)
+class DomainCost:
+    """Of controllers ``K [R, n_u, n_o]`` in a domain; it knows its gradient.
+
+    See :class:`ipo.game.WithSlope`: by hand the gradient takes half of autograd's time.
+
+    Attributes:
+        problem: R problems.
+        seen: what the domain shows of the state, ``[R, n_o, n_x]``.
+    """
+
+    problem: LQR
+    seen: Tensor
+
+    def __call__(self, K: Tensor) -> Tensor:
+        return feedback_costs(K @ self.seen, self.problem)
+
+    def slope(self, K: Tensor, share: float = 1.0) -> Slope:
+        costs, of_feedback = self.slope_in_feedback(torch.bmm(K, self.seen), share)
+        return costs, [torch.bmm(of_feedback, self.seen.mT)]
+
+    def slope_in_feedback(self, F: Tensor, share: float = 1.0) -> tuple[Tensor, Tensor]:
+        """The same for ``F = K seen``."""
+        return feedback_slopes(F, self.problem, share)
+
+
+class PooledCost(DomainCost):
+    """The mean over domains, ``seen [R, n_o, E n_x]`` side by side."""
+
+    def __call__(self, K: Tensor) -> Tensor:
+        return feedback_costs(self._by_domain(K @ self.seen), self.problem).mean(1)
+
+    def slope_in_feedback(self, F: Tensor, share: float = 1.0) -> tuple[Tensor, Tensor]:
+        share /= self.problem.num_domains
+        costs, slopes = feedback_slopes(self._by_domain(F), self.problem, share)
+        return costs.mean(1), slopes.transpose(1, 2).flatten(2)
+
+    def _by_domain(self, F: Tensor) -> Tensor:
+        return split_domains(F, self.problem.num_domains)
+
+
 @checked
 def gradient_descent(
     problem: LQR, settings: LQRSettings, start: Gains, seeds: Annotated[Seeds, "R"]
 ) -> Learner:
     """One player that owns all domains: gradient descent on the pooled cost of K."""
     player = _players(settings, start, num_players=1)
-    generators = [np.random.default_rng(np.random.SeedSequence(s).spawn(2)[1]) for s in seeds]
-
-    def cost(K: Tensor) -> Tensor:
-        if not settings.regularized:
-            return _pooled_cost(K, problem)
-        return regularized_cost(K, problem, settings, generators)
-
+    cost: Cost = PooledCost(problem, problem.seen)
+    if settings.regularized:
+        streams = [np.random.default_rng(np.random.SeedSequence(s).spawn(2)[1]) for s in seeds]
+        cost = lambda K: regularized_cost(K, problem, settings, streams)  # noqa: E731
     return Learner(
         iterate=lambda: player.round([cost]),
         gain=lambda: player.policy,
@@ -152,10 +198,10 @@ def overparameterized(
 ) -> Learner:
     """The same player with a controller of two layers, ``K = K_2 K_1``, and one optimiser."""
     Phi, K = _random_layers(problem, settings, seeds)
-    optimizer = _optimizer(settings, [Phi, K])
+    optimizer, cost = _optimizer(settings, [Phi, K]), PooledCost(problem, problem.seen)
 
     def respond(_: int) -> None:
-        descend(optimizer, lambda: _pooled_cost(K @ Phi, problem), settings.max_gradient_norm)
+        descend(optimizer, lambda: cost(K @ Phi), settings.max_gradient_norm)
 
     return Learner(
         iterate=lambda: play_round(1, respond),
@@ -169,7 +215,7 @@ def ipo_fixed_phi(
 ) -> Learner:
     """A player per domain, each with a whole controller; their average acts (Phi = identity)."""
     players = _players(settings, start, problem.num_domains)
-    costs = _costs_of_domains(problem)
+    costs = _costs_of_domains(problem, problem.seen)
     return Learner(
         iterate=lambda: players.round(costs),
         gain=lambda: players.policy,
@@ -182,46 +228,28 @@ def ipo_variable_phi(
 ) -> Learner:
     """Phi moves on the pooled cost of all domains, then every player on its own, above Phi."""
     Phi, K = _random_layers(problem, settings, seeds)
+    Phi = Phi.detach()
     players = _players(settings, K, problem.num_domains)
     optimizer = _optimizer(settings, [Phi])
-    known: list[Tensor] = []  # Phi [W_1 ... W_E], [R, n_h, E n_x], until Phi moves
-    features: list[Tensor] = []  # the same, for each domain
+    pooled = PooledCost(problem, problem.seen)
+    features = Phi @ problem.seen  # [R, n_h, E n_x], until Phi moves
+    costs = _costs_of_domains(problem, features)
 
-    def pooled_cost() -> Tensor:
-        # L-BFGS asks for several Phi in a step: only the first one's features are known.
-        seen = known.pop() if known else Phi.detach() @ problem.seen
-        F = _FeedbackBehindPhi.apply(Phi, players.policy, problem.seen, seen)
-        return feedback_costs(split_domains(F, problem.num_domains), problem).mean(1)
+    def slope_in_phi(features: Tensor) -> Slope:
+        costs, of_feedback = pooled.slope_in_feedback(players.policy @ features)
+        return costs, [players.policy.mT @ (of_feedback @ problem.seen.mT)]
 
     def move_phi() -> None:
-        descend(optimizer, pooled_cost, settings.max_gradient_norm)
-        known[:] = [Phi.detach() @ problem.seen]
-        features[:] = split_domains(known[0], problem.num_domains).unbind(1)
+        nonlocal features
+        again = lambda: slope_in_phi(Phi @ problem.seen)  # noqa: E731
+        step(optimizer, slope_in_phi(features), again, settings.max_gradient_norm)
+        features = Phi @ problem.seen
+        costs[:] = _costs_of_domains(problem, features)
 
-    costs = [
-        lambda K, d=d: feedback_costs(K @ features[d], problem) for d in range(problem.num_domains)
-    ]
     return Learner(
         iterate=lambda: players.round(costs, move_phi=move_phi),
-        gain=lambda: players.policy @ Phi.detach(),
+        gain=lambda: players.policy @ Phi,
     )
-
-
-class _FeedbackBehindPhi(torch.autograd.Function):
-    """``F = K (Phi W)`` as a function of Phi, where ``Phi W`` is known from the last round.
-
-    Backwards ``dPhi = K' (dF W')``, the products in the order that costs least.
-    """
-
-    @staticmethod
-    def forward(ctx: Any, Phi: Tensor, K: Tensor, W: Tensor, features: Tensor) -> Tensor:
-        ctx.save_for_backward(K, W)
-        return torch.bmm(K, features)
-
-    @staticmethod
-    def backward(ctx: Any, grad_F: Tensor) -> tuple[Tensor, None, None, None]:
-        K, W = ctx.saved_tensors
-        return torch.bmm(K.mT, torch.bmm(grad_F, W.mT)), None, None, None
 
 
 @checked
@@ -230,7 +258,7 @@ def in_turn(
 ) -> Learner:
     """IPO without players: one controller, whose one optimiser visits the domains in turn."""
     player = _players(settings, start, num_players=1)
-    costs = _costs_of_domains(problem)
+    costs = _costs_of_domains(problem, problem.seen)
     return Learner(
         iterate=lambda: play_round(len(costs), lambda d: player.round([costs[d]])),
         gain=lambda: player.policy,
@@ -243,7 +271,7 @@ def ensemble(
 ) -> Learner:
     """IPO without its domains: as many players, each of which moves on the pooled cost."""
     players = _players(settings, start, problem.num_domains)
-    costs = [lambda K: _pooled_cost(K, problem)] * problem.num_domains
+    costs = [PooledCost(problem, problem.seen)] * problem.num_domains
     return Learner(
         iterate=lambda: players.round(costs),
         gain=lambda: players.policy,
@@ -304,24 +332,16 @@ def train(
                 learner.iterate()
 
 
-def _pooled_cost(K: Tensor, problem: LQR) -> Tensor:
-    """Of all training domains, ``[R]``."""
-    return _costs(K, problem).mean(1)
-
-
 def _costs(K: Tensor, problem: LQR) -> Tensor:
     """Of each training domain, ``[R, E]``."""
     return feedback_costs(split_domains(K @ problem.seen, problem.num_domains), problem)
 
 
-def _costs_of_domains(problem: LQR) -> list[Cost]:
-    """Of the controller ``[R, n_u, n_o]`` that acts, one for each training domain."""
-
-    def cost(K: Tensor, W: Tensor) -> Tensor:
-        return feedback_costs(K @ W, problem)
-
+def _costs_of_domains(problem: LQR, seen: Tensor) -> list[DomainCost]:
+    """One for each training domain, of what is ``seen [R, rows, E n_x]`` in all of them."""
     # One block for each domain: twice as fast.
-    return [partial(cost, W=W.contiguous()) for W in problem.W_train.unbind(1)]
+    parts = split_domains(seen, problem.num_domains).unbind(1)
+    return [DomainCost(problem, part.contiguous()) for part in parts]
 
 
 def _players(settings: LQRSettings, start: Tensor, num_players: int) -> LinearPlayers:

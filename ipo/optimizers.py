@@ -1,4 +1,4 @@
-"""The optimisers that a player can be given, all behind one call: :func:`descend`.
+"""The optimisers that a player can be given, all behind one call: :func:`step`.
 
 ``adam`` is what the paper's runs use, ``plain`` is the gradient descent of its text, and
 ``lbfgs`` shows what a quasi-Newton method makes of the same costs.
@@ -15,6 +15,7 @@ from torch import Tensor
 from ipo.checks import NonNegative, Positive, checked, one_of
 
 OPTIMIZERS = ("adam", "plain", "lbfgs")
+Slope = tuple[Tensor, Sequence[Tensor]]  # costs [runs], and a gradient for each leaf
 
 
 @checked
@@ -46,23 +47,47 @@ def descend(
     objective: Callable[[], Tensor],
     max_gradient_norm: float | None = None,
 ) -> None:
-    """One step down ``objective() -> [runs]``, for all runs at once.
+    """One step down ``objective() -> [runs]``, for all runs at once, differentiated by autograd.
 
     Only the optimiser's own leaves are differentiated, so nobody else moves and no time is
-    spent on gradients that are not used. ``max_gradient_norm`` bounds the norm of each
-    leaf's gradient, run by run.
+    spent on gradients that are not used.
     """
-    leaves = [leaf for group in optimizer.param_groups for leaf in group["params"]]
+    leaves = _leaves(optimizer)
 
-    def closure() -> float:
+    def slope() -> Slope:
         costs = objective()
         # The runs do not interact: the gradient of their sum holds the gradient of each.
-        gradients = torch.autograd.grad(costs.sum(), leaves)
+        return costs.detach(), torch.autograd.grad(costs.sum(), leaves)
+
+    step(optimizer, slope(), slope, max_gradient_norm)
+
+
+def step(
+    optimizer: torch.optim.Optimizer,
+    first: Slope,
+    again: Callable[[], Slope],
+    max_gradient_norm: float | None = None,
+) -> None:
+    """One step down costs whose slope where the leaves are is known.
+
+    ``again()`` is the slope where they are then: L-BFGS tries several weights in a step.
+    ``max_gradient_norm`` bounds the norm of each leaf's gradient, run by run.
+    """
+    leaves, known = _leaves(optimizer), [first]
+
+    def closure() -> float:
+        costs, gradients = known.pop() if known else again()
         for leaf, gradient in zip(leaves, gradients, strict=True):
             leaf.grad = _clip(gradient, max_gradient_norm)
-        return float(costs.detach().sum())
+        return float(costs.sum())
 
     optimizer.step(closure)
+    for leaf in leaves:
+        leaf.grad = None  # the next gradient takes its memory, which is still in the cache
+
+
+def _leaves(optimizer: torch.optim.Optimizer) -> list[Tensor]:
+    return [leaf for group in optimizer.param_groups for leaf in group["params"]]
 
 
 def _clip(gradient: Tensor, max_norm: float | None) -> Tensor:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, Any
 
 import numpy as np
@@ -257,37 +257,6 @@ def values(task: TabularTask, policy: Policies) -> tuple[np.ndarray, np.ndarray]
         value = earlier
     returns, success = np.split(value, 2, axis=1)
     return returns, success
-
-
-@checked
-def reach(task: TabularTask, policy: Policies, states: Annotated[np.ndarray, "S"]) -> np.ndarray:
-    """Probability ``[P]`` that policies ``[P, K, A]`` ever come to one of ``states [S]``.
-
-    Within the horizon; ``states`` are true where the search ends.
-    """
-    entered = states[task.next_state] & ~task.done
-    goal = replace(
-        task, goal=entered, done=task.done | entered, start=np.where(states, 0.0, task.start)
-    )
-    return expected_return(goal, policy)[1] + float(task.start @ states)
-
-
-@checked
-def occupancy(task: TabularTask, policy: Policies) -> np.ndarray:
-    """Expected number of steps ``[P, S]`` that policies ``[P, K, A]`` spend in each state.
-
-    mu_(t+1)(s') = sum_(s, a) mu_t(s) pi(a | s) 1{not done},    summed over t < T
-    """
-    goes_on = policy[:, task.observation] * ~task.done  # [P, S, A]
-    present = np.tile(task.start, (len(policy), 1))
-    total = np.zeros_like(present)
-    for _ in range(task.horizon):
-        total += present
-        later = np.zeros_like(present)
-        for action, next_state in enumerate(task.next_state.T):
-            np.add.at(later.T, next_state, (present * goes_on[..., action]).T)
-        present = later
-    return total
 
 
 @checked

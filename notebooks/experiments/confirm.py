@@ -7,6 +7,8 @@ For each cell the first recorded batch is computed again and held beside the shi
 - ``exact``: equal in all nine digits, as on the same kind of machine;
 - ``close``: every value within ten times the tolerance of the chapter's slices;
 - ``alike``: for networks, whose training is chaotic, runs that could be others of the same cell;
+- ``unsettled``: a training that never comes to rest, whose rounding decides where it stands in the
+  end: runs no further away than they move in its last part, and in no direction;
 - ``differs`` otherwise, and the command fails in the end.
 
 The outcome stands in ``data/confirmed.json`` with the commit of the code, machine and packages.
@@ -46,6 +48,7 @@ CHAOTIC = (
     *("cue/two_domains", "cue/three_domains", "cue/four_domains", "cue/encodings"),
 )
 LEVEL, MANY = 0.001, 5
+UNREST = 2.0  # times what runs move by before the end: a little more than where they were stopped
 LONGER = 10.0  # times the tolerance of a slice: rounding grows over thousands of steps
 NOT_PLACES = ("run", "value", "value_now", "_merge")
 
@@ -131,16 +134,42 @@ def alike(shipped: pd.DataFrame, columns: dict[str, Any], both: pd.DataFrame) ->
     return bool((outside.groupby([beside["domain"], beside["metric"]]).mean() <= 0.5).all())
 
 
+def unsettled(both: pd.DataFrame, before: pd.DataFrame) -> bool:
+    """Whether rows differ from the shipped ones by no more than where a training was stopped.
+
+    Of each metric and domain runs are on average at most UNREST times as far from what is shipped
+    as from what they were ``before`` the end, and by a paired t-test they are to neither side of
+    it. So it is never true of a training that is at rest.
+    """
+    keys = [column for column in before.columns if column != "value"]
+    three = both.merge(before.rename(columns={"value": "value_before"}), on=keys)
+    three["apart"] = three["value_now"] - three["value"]
+    three["moved"] = three["value_now"] - three["value_before"]
+    groups = [own for _, own in three.groupby(["domain", "metric"])]
+    p = [scipy.stats.ttest_1samp(own["apart"], 0).pvalue for own in groups if own["apart"].any()]
+    near = [own["apart"].abs().mean() <= UNREST * own["moved"].abs().mean() for own in groups]
+    return all(near) and min(p, default=1.0) > LEVEL / len(groups)
+
+
 def _outcome(part: Slice, scratch: Path) -> tuple[str, dict[str, Any]]:
     rows = part.run(scratch)
+    how = compared(part, rows)
+    if how == "differs" and _is_unsettled(part, rows, scratch):
+        how = "unsettled"
     return title(part), {
-        "how": compared(part, rows),
+        "how": how,
         "runs": len(part.batch["seeds"]),
         "commit": origin.commit(),
         "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
         "machine": origin.machine(),
         "packages": ", ".join(f"{name} {number}" for name, number in origin.versions().items()),
     }
+
+
+def _is_unsettled(part: Slice, rows: pd.DataFrame, scratch: Path) -> bool:
+    recorded = Store(DATA / "results" / part.chapter, part.name).rows_of(part.batch)
+    both, before = side_by_side(recorded, rows), part.run_earlier(scratch)
+    return both is not None and before is not None and unsettled(both, before)
 
 
 def _is_done(done: dict[str, dict[str, Any]], name: str, since: str | None) -> bool:

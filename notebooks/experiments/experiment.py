@@ -66,6 +66,9 @@ class Experiment:
         checkpoints: ``checkpoints(cell, seed)`` are the files that carry the work of a run. It is
             not the run that removes them but the store, when the rows are saved and read back.
             ``None``: nothing is kept on the way.
+        earlier: ``earlier(cell)`` is the cell a little before the end of its training, or None if
+            it is not trained: what moves until then is not at rest, and ``make confirm`` cannot
+            ask for the same digits. ``None``: all cells come to rest.
     """
 
     run: Callable[..., pd.DataFrame]
@@ -75,6 +78,7 @@ class Experiment:
     reads: Callable[..., list[Path]] | None = None
     runs_at_once: Count | None = None
     checkpoints: Callable[..., list[Path]] | None = None
+    earlier: Callable[[Any], Any | None] | None = None
 
     def at(self, places: Places) -> Experiment:
         """The same, where the run function knows its folders."""

@@ -22,6 +22,7 @@ from experiments.policies import check_place, load_policy, save_policy
 from experiments.rows import tidy
 from experiments.tables import mean_and_std
 from experiments.tabulated import load_or_tabulate
+from experiments.visits import occupancy, reach
 from ipo.checks import Count, Positive, check_choice, check_choices, checked, one_of
 from ipo.distributions import Categorical
 from ipo.networks import GridNetwork, OnTable, Weights
@@ -32,9 +33,7 @@ from ipo.worlds.tabular import (
     TabularDomains,
     TabularTask,
     expected_return,
-    occupancy,
     optimal_policy,
-    reach,
     tabulate,
 )
 

@@ -25,7 +25,7 @@ import pandas as pd
 from tqdm import tqdm
 
 from experiments import own_domains
-from experiments.experiment import Cell, rebuilt
+from experiments.experiment import Cell, Experiment, rebuilt
 from experiments.orphans import interrupt_on_sigterm
 from experiments.registry import CHAPTERS, DATA, again, chosen
 from experiments.store import Batch, Store, timed
@@ -66,9 +66,18 @@ class Slice:
     batch: Batch
 
     def run(self, scratch: Path) -> pd.DataFrame:
-        experiment = again(self.chapter, self.name, scratch)
-        cell = rebuilt(experiment.cell, self.batch["cell"])
+        experiment, cell = self._experiment(scratch)
         return timed(experiment.run, cell, self.batch["seeds"])[1]
+
+    def run_earlier(self, scratch: Path) -> pd.DataFrame | None:
+        """The rows a little before the end of a training; None: it has no such cell."""
+        experiment, cell = self._experiment(scratch)
+        before = experiment.earlier(cell) if experiment.earlier else None
+        return timed(experiment.run, before, self.batch["seeds"])[1] if before else None
+
+    def _experiment(self, scratch: Path) -> tuple[Experiment, Cell]:
+        experiment = again(self.chapter, self.name, scratch)
+        return experiment, rebuilt(experiment.cell, self.batch["cell"])
 
 
 def slices(names: Sequence[str] = ()) -> Iterator[Slice]:

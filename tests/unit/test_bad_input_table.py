@@ -28,7 +28,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from small import paper_problem, random_gain
 
 import ipo
-from experiments import keys, tables
+from experiments import keys, tables, visits
 from experiments import lqr as lqr_experiments
 from experiments.chapter import Chapter
 from experiments.doors import hooking, pulling, success, training
@@ -594,10 +594,10 @@ def rows_of_worlds() -> Iterator[Row]:
     wrong = bad("probability", 2 * policy, policy - [1, -1], np.zeros((3, 2, 2)))
     policies = lambda good: array("runs")(good) + wrong  # noqa: E731
     at = {"task": task, "policy": policy}
-    for function in (tabular.expected_return, tabular.values, tabular.occupancy):
+    for function in (tabular.expected_return, visits.occupancy):
         yield row(function, at, policy=policies)
     states = np.zeros(len(task.start), bool)
-    yield row(tabular.reach, at | {"states": states}, policy=policies, states=array("nan inf"))
+    yield row(visits.reach, at | {"states": states}, policy=policies, states=array("nan inf"))
     yield row(tabular.optimal_policy, {"task": task})
 
 
@@ -627,6 +627,7 @@ def rows_of_experiments() -> Iterator[Row]:
         run=FUNCTION,
         cell=OBJECT,
         short=FUNCTION,
+        earlier=FUNCTION,
         seeds=bad("kind of object", 3, "01", (0.5,)) + bad("range", (-1,), (0, 0), ()),
         reads=FUNCTION,
     )
@@ -726,8 +727,9 @@ TRUSTING = {
     r"ipo\.(checks|notebooks)\..*": "is a check itself; in test_bad_input.py",
     r"ipo\.distributions\..*": LOOP,
     r"ipo\.game\.average": LOOP,
-    r"ipo\.optimizers\.descend": LOOP,
-    r"ipo\.lqr\.feedback_costs": LOOP,
+    r"ipo\.(game\.slope|optimizers\.(descend|step))": LOOP,
+    r"ipo\.lqr\.feedback_(costs|slopes)": LOOP,
+    r"ipo\.lqr_learners\.(Domain|Pooled)Cost.*": LOOP,
     r"ipo\.lqr\.(LQR\.to|split_domains)": "torch's own conversion and view, by a new name",
     r"ipo\.lqr_learners\.Learner": RECORD,
     r"ipo\.lqr_learners\.regularized_cost": LOOP,
@@ -771,7 +773,7 @@ def public() -> dict[str, Callable]:
     found: dict[str, Callable] = {}
     modules = [module.name for module in pkgutil.walk_packages(ipo.__path__, "ipo.")]
     games = regressions, scalar_control
-    modules += [module.__name__ for module in (tables, *games, hooking, pulling)]
+    modules += [module.__name__ for module in (tables, visits, *games, hooking, pulling)]
     for module in modules:
         for name, thing in vars(importlib.import_module(module)).items():
             if getattr(thing, "__module__", None) != module or name.startswith("_"):

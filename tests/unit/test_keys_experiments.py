@@ -32,9 +32,10 @@ from experiments.keys import (
 from experiments.policies import load_policy
 from experiments.store import Batch, Store
 from experiments.tables import beside_shipped
+from experiments.visits import occupancy
 from ipo.networks import GridNetwork
 from ipo.worlds.colored_keys import COLORS
-from ipo.worlds.tabular import TabularTask, expected_return, occupancy
+from ipo.worlds.tabular import TabularTask, expected_return
 
 DATA = Path(__file__).resolve().parents[2] / "data"
 RESULTS, POLICIES = DATA / "results" / "keys", DATA / "policies" / "keys"

@@ -10,12 +10,14 @@ import torch
 from small import assert_close, paper_problem, random_gain, trained_gain
 from torch import Tensor
 
+from ipo.game import slope
 from ipo.lqr import LQR, invariant_gain, minimum_norm_gain, project, row_space, training_costs
 from ipo.lqr_learners import (
     LQR_CONTROLS,
     LQR_METHODS,
+    DomainCost,
     LQRSettings,
-    _FeedbackBehindPhi,
+    PooledCost,
     published_lqr,
     train,
 )
@@ -148,7 +150,7 @@ def test_gradient_descent_is_the_game_of_one_player_that_owns_all_domains(optimi
     own = make_optimizer(optimizer, [K], chosen.learning_rate)
     for _ in range(chosen.num_iterations):
         descend(own, lambda: training_costs(K, problem).mean(1))
-    assert torch.equal(K.detach(), trained_gain(problem, chosen, SEEDS))
+    assert_close(trained_gain(problem, chosen, SEEDS), K.detach())
 
 
 def test_ipo_in_one_domain_is_gradient_descent():
@@ -303,13 +305,11 @@ def test_published_settings_are_the_papers(method):
     assert (chosen.weight_decay, chosen.max_gradient_norm) == (0, None)
 
 
-def test_feedback_behind_phi_is_the_product_with_its_gradient():
-    Phi, K, W = (torch.randn(2, *size).double() for size in ((3, 5), (2, 3), (5, 4)))
-    Phi.requires_grad_()
-    assert_close(_FeedbackBehindPhi.apply(Phi, K, W, Phi.detach() @ W), K @ Phi.detach() @ W)
-    grad_F = torch.randn(2, 2, 4).double()
-    ours, plain = (
-        torch.autograd.grad(F, Phi, grad_F)[0]
-        for F in (_FeedbackBehindPhi.apply(Phi, K, W, Phi.detach() @ W), K @ Phi @ W)
-    )
-    assert_close(ours, plain)
+def test_slope_of_a_cost_is_that_of_autograd():
+    problem = paper_problem()
+    K = random_gain(problem)
+    for cost in (PooledCost(problem, problem.seen), DomainCost(problem, problem.W_test)):
+        costs, (gradient,) = cost.slope(K, share=0.25)
+        expected, (by_torch,) = slope(lambda K, cost=cost: cost(K), K, share=0.25)
+        assert_close(costs, expected)
+        assert_close(gradient, by_torch)

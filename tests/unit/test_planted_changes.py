@@ -18,7 +18,12 @@ pytestmark = pytest.mark.slow
 
 # Where it is planted, what is replaced by what, and the slices that are computed again.
 CHANGES = {
-    "sign of a gradient": ("ipo/lqr.py", "RF - B.mT", "RF + B.mT", "lqr/curves"),
+    "sign in a gradient": (
+        "ipo/lqr.py",
+        "torch.bmm(P, M), alpha=-1)",
+        "torch.bmm(P, M), alpha=1)",
+        "lqr/curves",
+    ),
     "order of draws": (
         "ipo/lqr.py",
         "        A = contraction * random_orthogonal(random, dim_state, dim_state)\n"
@@ -41,8 +46,8 @@ CHANGES = {
     ),
     "weight of a player in the average": (
         "ipo/game.py",
-        "cost(self.policy.add(player, alpha=share))",
-        "cost(self.policy.add(player, alpha=1.0))",
+        "first = slope(cost, self.policy, share)",
+        "first = slope(cost, self.policy, 1.0)",
         "algorithm/table",
     ),
     "ownership of an ensemble": (
@@ -75,10 +80,10 @@ CHANGES = {
         "29 * np.abs(door_angle)",
         "door/gaps",  # the policies there open doors; the first update of a training does not
     ),
-    "entropy of a Gaussian": (
+    "gradient of a Gaussian's entropy": (
         "ipo/distributions.py",
-        "(0.5 + deviation.log() + LOG_SQRT_TAU)",
-        "(0.5 + 1.5 * deviation.log() + LOG_SQRT_TAU)",
+        "(standard.square() - 1) + entropy_weight",
+        "(standard.square() - 1) + 1.5 * entropy_weight",
         "door/curves",
     ),
     "mean for sum in a penalty": (

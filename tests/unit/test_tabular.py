@@ -21,6 +21,7 @@ from minigrid.envs import DynamicObstaclesEnv
 from experiments import tabulated
 from experiments.sealed import write_sealed
 from experiments.tabulated import TableWarning, load_or_tabulate
+from experiments.visits import occupancy, reach
 from ipo.worlds.colored_keys import COLORS, ColoredKeysEnv
 from ipo.worlds.tabular import (
     NotTabularError,
@@ -28,9 +29,7 @@ from ipo.worlds.tabular import (
     TabularEnvironments,
     TabularTask,
     expected_return,
-    occupancy,
     optimal_policy,
-    reach,
     state_of,
     tabulate,
 )

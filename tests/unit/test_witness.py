@@ -4,6 +4,7 @@ import runpy
 import shutil
 from dataclasses import replace
 
+import numpy as np
 import pandas as pd
 import pytest
 import toy_experiment
@@ -114,6 +115,44 @@ def test_chaotic_runs_are_alike_or_not(shift, num_runs, expected):
     again = curves(range(5, 5 + num_runs), shift)
     both = witness.side_by_side(shipped[shipped["run"].isin(again["run"])], again)
     assert confirm.alike(shipped, {"method": "a"}, both) == expected
+
+
+def ends(phase: float, shift: float = 0.0, size: float = 1.0) -> pd.DataFrame:
+    """Where runs stand that go round in a circle, each from a place of its own."""
+    return pd.DataFrame(
+        {"run": r, "domain": "d", "metric": m, "value": 5 + shift + size * np.sin(2.4 * r + phase)}
+        for r in range(20)
+        for m in ("a", "b")
+    )
+
+
+@pytest.mark.parametrize(
+    ("now", "before", "expected"),
+    [
+        (ends(1.0), ends(2.0), True),
+        (ends(1.0, shift=3.0), ends(2.0, shift=3.0), False),  # somewhere else
+        (ends(1.0, shift=0.9), ends(2.0, shift=0.9), False),  # as near, but to one side
+        (ends(1.0), ends(1.3), False),  # slower than it is far
+        (ends(0.0, shift=1e-3), ends(0.0, shift=1e-3), False),  # at rest
+    ],
+)
+def test_where_an_unsettled_training_may_end(now, before, expected):
+    both = witness.side_by_side(ends(0.0), now)
+    assert confirm.unsettled(both, before) == expected
+
+
+@pytest.mark.parametrize(("moves", "how"), [(0.0, "differs"), (2.0, "unsettled")])
+def test_only_what_does_not_rest_may_be_elsewhere(toy, monkeypatch, moves, how):
+    def elsewhere(cell: Cell, seeds: list[int]) -> pd.DataFrame:
+        """Runs one up and one down, and up and down again before the end."""
+        rows = run(cell, seeds)
+        side = np.where(rows["run"] % 2, 1.0, -1.0)
+        return rows.assign(value=rows["value"] + side * (1 + moves * (cell.power == 0.25)))
+
+    experiment = Experiment(elsewhere, Cell, short, earlier=lambda cell: replace(cell, power=0.25))
+    monkeypatch.setitem(registry.CHAPTERS["lqr"], "toy", experiment)
+    parts = list(confirm.full_batches(["lqr"]))
+    assert {confirm._outcome(part, toy)[1]["how"] for part in parts} == {how}
 
 
 def test_an_experiment_that_is_not_there_is_named():
