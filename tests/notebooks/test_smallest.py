@@ -47,7 +47,13 @@ SMALLEST = {
         "larger_size": 5,
         "grid_sizes": [5],
     },
-    "cue": {"num_runs": 2, "num_updates": 1, "cues": [0.9], "more_cues": [0.1]},
+    "cue": {
+        "num_runs": 2,
+        "num_updates": 1,
+        "num_updates_first": 1,
+        "cues": [0.1, 0.5],
+        "more_cues": [0.1],
+    },
     "door": {
         "num_runs": 2,
         "num_updates": 2,

@@ -24,12 +24,15 @@ from ipo.worlds.tabular import TabularDomains, expected_return
 DATA = Path(__file__).resolve().parents[2] / "data"
 RESULTS = DATA / "results" / "cue"
 GRIDS = {2: theory.STRONGER, 3: theory.COARSE, 4: theory.COARSE}
-NUM_UPDATES, NUM_RUNS = 25, 30
+NUM_UPDATES, NUM_UPDATES_FIRST, NUM_RUNS = 60, 25, 30
+POINT = (0.9, -0.3)  # where steps and frames are varied
 ASKED = {
     "two_domains": training.phase_cells(theory.points(2, theory.STRONGER), NUM_UPDATES),
     "three_domains": training.phase_cells(theory.points(3, theory.COARSE), NUM_UPDATES),
     "four_domains": training.phase_cells(theory.points(4, theory.COARSE), NUM_UPDATES),
     "encodings": training.encoding_cells(theory.disputed(theory.STRONGER), NUM_UPDATES),
+    "many_steps": training.many_step_cells(theory.contested(theory.STRONGER), NUM_UPDATES_FIRST),
+    "varied": training.varied_cells(POINT, NUM_UPDATES),
 }
 
 
@@ -111,7 +114,7 @@ def test_penalty_is_the_smallest_that_is_enough():
 
 
 def tiny(method="ppo", cues=(0.9, -0.9), **more):
-    settings = replace(training.settings(method, 1), num_envs=16, num_steps=4)
+    settings = replace(training.one_step(method, 1), num_envs=16)
     return training.Cell(settings, cues, **more)
 
 

@@ -13,6 +13,7 @@ from matplotlib.patheffects import withStroke
 
 from experiments.cue.outcomes import NAMES
 from experiments.cue.theory import GROUPS, STRENGTH, Cues, text
+from experiments.figures import STYLES, draw_metric
 from ipo.worlds.cued_maze import LANDMARK
 
 OUTLINED = [withStroke(linewidth=3.5, foreground="black")]  # white on yellow can be seen
@@ -36,6 +37,24 @@ def maze() -> Figure:
     ax.text(0.75, 0.5, "start", va="center", fontsize=9)
     ax.set(xlim=(-3, 3), ylim=(-0.2, 4.1), aspect="equal")
     ax.axis("off")
+    return fig
+
+
+def waiting(runs: pd.DataFrame) -> Figure:
+    """Return in the worst domain by the number of steps that a player makes before an answer."""
+    rows = runs["worst"].rename("value").reset_index().assign(metric="worst")
+    least = rows["frames"] == rows["frames"].min()
+    fig, ax = plt.subplots(figsize=(7, 3.8))
+    draw_metric(ax, rows[least], "worst", "steps", ("ppo", "ipo"))
+    for method, own in rows[~least].groupby("method"):
+        _, color, marker = STYLES[method]
+        ax.plot(0.85, own["value"].mean(), color=color, marker=marker, ms=8, mfc="none")
+    ax.axhline(LANDMARK, color="0.5", lw=1, ls=":")
+    ax.set_xscale("log", base=2)
+    steps = sorted(rows["steps"].unique())
+    ax.set_xticks(steps, steps)
+    ax.set(xlabel="gradient steps on each rollout", ylabel="return in the worst domain")
+    ax.legend(fontsize=8)
     return fig
 
 

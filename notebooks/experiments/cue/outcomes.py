@@ -30,7 +30,9 @@ def by_run(rows: pd.DataFrame) -> pd.DataFrame:
     A return is linear in the cue, so those at both extremes tell everything: ``worst`` is the
     return in the worst of *all* domains, ``plain`` that without a cue, ``use`` what the cue adds.
     """
-    wide = rows.pivot(index=["encoding", "cues", "method", "run"], columns="domain", values="value")
+    values = {"domain", "metric", "value"}
+    places = [column for column in rows.columns if column not in values]
+    wide = rows.pivot(index=sorted(places), columns="domain", values="value")
     wrong, right = wide["-1"], wide["1"]
     worst, plain = np.minimum(wrong, right), (wrong + right) / 2
     return pd.DataFrame({"worst": worst, "plain": plain, "use": right - wrong})
@@ -144,16 +146,22 @@ def difference_counts(found: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(lines)
 
 
-def notable(found: pd.DataFrame, baseline: str) -> pd.DataFrame:
-    """The points at which IPO was predicted, or found, to differ from a baseline."""
-    own = found[found["baseline"] == baseline]
-    own = own[(own[["predicted", "verdict"]] != "alike").any(axis=1)]
+def mean_by_method(runs: pd.DataFrame) -> pd.DataFrame:
+    """Mean return in the worst domain: a line for each point, a column for each method by name."""
+    mean = runs["worst"].groupby(level=["cues", "method"]).mean().unstack()
+    return mean.rename(columns=NAMES).reset_index()
+
+
+def notable(found: pd.DataFrame, shown: Sequence[str]) -> pd.DataFrame:
+    """The lines in which IPO was predicted, or found, to differ, with some columns of means."""
+    own = found[(found[["predicted", "verdict"]] != "alike").any(axis=1)]
     interval = [
         f"[{low:+.2f}, {high:+.2f}]" for low, high in zip(own["low"], own["high"], strict=True)
     ]
     return pd.DataFrame(
         {
-            "cues": own["cues"],
+            "cues": own["cues"].str.replace("-", "−"),
+            **{name: own[name].map("{:.2f}".format) for name in shown},
             "difference": own["mean"].map("{:+.2f}".format),
             "95 % interval": interval,
             "predicted": own["predicted"],

@@ -54,6 +54,11 @@ def disputed(values: Sequence[float]) -> list[Cues]:
     return [c for c in points(2, values) if c[0] > STRENGTH and c[1] < -STRENGTH]
 
 
+def contested(values: Sequence[float]) -> list[Cues]:
+    """Points of two domains where the game is predicted to help."""
+    return [c for c in points(2, values) if pooled(c) == CUE_WINS and game(c) == LANDMARK_WINS]
+
+
 # -------------------------------------------------------------------------------- the rules
 
 

@@ -53,12 +53,14 @@ class Cell:
         return {"method": method, "cues": text(self.cues), "encoding": self.encoding}
 
 
-class Waiting(Cell):
-    """A cell by how many gradient steps a player makes before the others answer."""
+class Varied(Cell):
+    """A cell by its gradient steps on each rollout, and by how many frames that has."""
 
     @property
     def columns(self) -> dict[str, Any]:
-        return super().columns | {"steps": self.settings.num_epochs}
+        of = self.settings
+        more = {"steps": of.num_epochs, "frames": of.num_steps * of.num_envs}
+        return super().columns | more
 
 
 def one_step(method: str, num_updates: int) -> PPOSettings:
@@ -116,11 +118,17 @@ def many_step_cells(points: Sequence[Cues], num_updates: int) -> list[Cell]:
     ]
 
 
-def waiting_cells(cues: Cues, steps: Sequence[int], num_updates: int) -> list[Waiting]:
-    """PPO and IPO at one point, with as many gradient steps in all, on fewer and fewer rollouts."""
+def varied_cells(cues: Cues, num_updates: int) -> list[Varied]:
+    """PPO and IPO at one point: more steps before the others answer, or more data for each.
+
+    All make as many gradient steps in all.
+    """
     return [
-        Waiting(replace(one_step(method, max(1, num_updates // num)), num_epochs=num), cues)
-        for num in steps
+        Varied(replace(one_step(method, max(1, num_updates // steps)), **changes), cues)
+        for steps, changes in (
+            *((steps, {"num_epochs": steps}) for steps in (1, 2, 4, 8, 16)),
+            (1, {"num_envs": 4 * 144}),
+        )
         for method in ("ppo", "ipo")
     ]
 
@@ -193,12 +201,14 @@ def short(cell: Cell) -> Cell | None:
     return replace(cell, settings=replace(cell.settings, num_updates=2))
 
 
-def short_waiting(cell: Waiting) -> Waiting:
-    """One update."""
+def short_varied(cell: Varied) -> Varied | None:
+    """One update, on rollouts that are not large."""
+    if cell.columns["frames"] > one_step("ppo", 1).num_envs * 4:
+        return None
     return replace(cell, settings=replace(cell.settings, num_updates=1))
 
 
 EXPERIMENTS = {
     name: Experiment(run_cell, Cell, short)
     for name in ("two_domains", "three_domains", "four_domains", "encodings", "many_steps")
-} | {"waiting": Experiment(run_cell, Waiting, short_waiting)}
+} | {"varied": Experiment(run_cell, Varied, short_varied)}
