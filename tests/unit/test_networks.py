@@ -46,13 +46,6 @@ def constant_player(logits: list[float], value: float) -> Weights:
 # ------------------------------------------------------------------- the grid network
 
 
-@given(
-    seed=st.integers(0, 1000),
-    num_channels=st.integers(1, 8),
-    num_actions=st.integers(1, 7),
-    num_runs=st.integers(1, 3),
-    num_images=st.integers(1, 5),
-)
 def test_a_wider_network_has_twice_as_many_weights():
     """A player alone that is as large as two; with one width, the published layers."""
 
@@ -63,6 +56,13 @@ def test_a_wider_network_has_twice_as_many_weights():
     assert count(math.sqrt(2)) == pytest.approx(2 * count(1), rel=0.01)
 
 
+@given(
+    seed=st.integers(0, 1000),
+    num_channels=st.integers(1, 8),
+    num_actions=st.integers(1, 7),
+    num_runs=st.integers(1, 3),
+    num_images=st.integers(1, 5),
+)
 def test_network_is_that_of_torch(seed, num_channels, num_actions, num_runs, num_images):
     network = DoubleNetwork(num_channels, num_actions)
     weights = network.start(generators(*range(seed, seed + num_runs)))
