@@ -3,5 +3,4 @@
 c = get_config()  # noqa: F821 (nbgrader defines it)
 
 c.CourseDirectory.course_id = "ipo"
-c.ClearSolutions.text_stub = "*Your answer.*"
 c.ExecutePreprocessor.timeout = 300  # seconds for a cell
