@@ -25,6 +25,7 @@ NOTHING = "<span></span>"
 # The contents of the first printing say nothing of pages; what came out tells the second.
 NUMBER_CONTENTS = """numbers => document.querySelectorAll('.page-number')
   .forEach(number => { number.textContent = numbers[number.dataset.of]; })"""
+MOST_SECONDS = 300  # of each step; a minute is usual on a slow machine
 MARGINS = {"top": "18mm", "bottom": "18mm", "left": "18mm", "right": "18mm"}
 
 
@@ -46,6 +47,7 @@ def print_book(html: Path, root: Path) -> None:
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=program, args=["--no-sandbox"])
         page = browser.new_page()
+        page.set_default_timeout(MOST_SECONDS * 1000)
         page.goto(together.resolve().as_uri(), wait_until="load")
         write_pdf(page, html / NAME)
         page.evaluate(NUMBER_CONTENTS, page_numbers(html / NAME))
