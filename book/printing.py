@@ -8,7 +8,8 @@ from pathlib import Path
 from urllib.parse import urldefrag
 
 from bs4 import BeautifulSoup, Tag
-from playwright.sync_api import sync_playwright
+from playwright.sync_api import Page, sync_playwright
+from pypdf import PdfReader
 
 from profiles import read_yaml, toc_entries
 
@@ -21,6 +22,10 @@ FOOTER = (
 )
 ON_SCREEN = "video, button, script, noscript, details.hide, .only-dark, .headerlink"
 NOTHING = "<span></span>"
+# The contents of the first printing say nothing of pages; what came out tells the second.
+NUMBER_CONTENTS = """numbers => document.querySelectorAll('.page-number')
+  .forEach(number => { number.textContent = numbers[number.dataset.of]; })"""
+MOST_SECONDS = 300  # of each step; a minute is usual on a slow machine
 MARGINS = {"top": "18mm", "bottom": "18mm", "left": "18mm", "right": "18mm"}
 
 
@@ -42,14 +47,29 @@ def print_book(html: Path, root: Path) -> None:
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=program, args=["--no-sandbox"])
         page = browser.new_page()
+        page.set_default_timeout(MOST_SECONDS * 1000)
         page.goto(together.resolve().as_uri(), wait_until="load")
-        page.pdf(
-            path=html / NAME, format="A4", margin=MARGINS, print_background=True, outline=True,
-            tagged=True, display_header_footer=True, header_template=NOTHING,
-            footer_template=FOOTER,
-        )  # fmt: skip
+        write_pdf(page, html / NAME)
+        page.evaluate(NUMBER_CONTENTS, page_numbers(html / NAME))
+        write_pdf(page, html / NAME)
         browser.close()
     together.unlink()
+
+
+def write_pdf(page: Page, path: Path) -> None:
+    page.pdf(
+        path=path, format="A4", margin=MARGINS, print_background=True, outline=True, tagged=True,
+        display_header_footer=True, header_template=NOTHING, footer_template=FOOTER,
+    )  # fmt: skip
+
+
+def page_numbers(path: Path) -> dict[str, int]:
+    """On which page every anchor stands that a link of the printed book leads to."""
+    reader = PdfReader(path)
+    return {
+        name.removeprefix("/"): reader.get_destination_page_number(place) + 1
+        for name, place in reader.named_destinations.items()
+    }
 
 
 def joined(html: Path, names: list[str]) -> BeautifulSoup:
@@ -117,6 +137,9 @@ def contents(whole: BeautifulSoup, articles: list[Tag]) -> Tag:
                 line = whole.new_tag("p", attrs={"class": f"entry-{title.name}"})
                 link = whole.new_tag("a", attrs={"href": f"#{section['id']}"})
                 link.string = title.get_text(strip=True)
-                line.append(link)
+                number = whole.new_tag("span", attrs={"class": "page-number"})
+                number.attrs["data-of"] = section["id"]
+                number.string = "000"
+                line.extend([link, number])
                 nav.append(line)
     return nav

@@ -43,7 +43,7 @@ SYSTEM_PACKAGES = (
     (
         ["chromium"],
         lambda: shutil.which("chromium"),
-        "the tests of the built site in a browser are skipped",
+        "the book has no PDF, and the tests of the site in a browser are skipped",
     ),
     (
         ["libegl1", "libgl1", "libgl1-mesa-dri", "libegl-mesa0"],

@@ -47,6 +47,9 @@ OUTCOMES = {
     "both unstable": "#30343A",
 }
 
+# Letters on a colour: no true greys, which change places on a page in dark mode.
+WHITE, BLACK = "#fffffe", "#000001"
+
 # Letters are large for the printed size: a page shows a figure smaller than it is drawn.
 STYLE = {
     "figure.dpi": 110,
@@ -344,7 +347,8 @@ def causal_graph(
             x, y, s=900, facecolor=face, edgecolor="black", linestyle=line, zorder=2, gid=name
         )
         text = (labels or {}).get(name, f"${name}$")
-        ax.text(x, y, text, ha="center", va="center", zorder=3)
+        ink = BLACK if name in changed else "black"
+        ax.text(x, y, text, ha="center", va="center", zorder=3, color=ink)
     ax.margins(0.25)
     ax.axis("off")
 
@@ -366,7 +370,7 @@ def write_numbers(
     """
     for (y, x), value in np.ndenumerate(cells):
         if not np.isnan(value):
-            ink = "white" if light[y, x] else "black"
+            ink = WHITE if light[y, x] else BLACK
             text = form.format(value)
             ax.text(x, y, text, ha="center", va="center", fontsize=fontsize, color=ink)
 
