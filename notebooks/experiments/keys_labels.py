@@ -28,6 +28,7 @@ from experiments.experiment import Experiment
 from experiments.keys import TESTED, Keys, evaluate, gap, runs_of
 from experiments.rows import tidy
 from experiments.tables import mean_and_std
+from experiments.visits import occupancy
 from ipo.checks import checked, one_of
 from ipo.distributions import Generators
 from ipo.networks import Weights
@@ -35,7 +36,6 @@ from ipo.worlds.tabular import (
     TabularDomains,
     TabularEnvironments,
     TabularTask,
-    occupancy,
     values,
 )
 
