@@ -26,7 +26,7 @@ SETTINGS: dict[tuple[str, str], PPOSettings | LQRSettings] = {
 }
 NAMES = {
     "gradient_descent": "Gradient descent",
-    "overparameterized": "Overparameterised",
+    "overparameterized": "Overparam.",
     "ipo_fixed_phi": "IPO",
     "ppo": "PPO",
     "ipo": "IPO",

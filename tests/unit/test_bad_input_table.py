@@ -256,7 +256,7 @@ def rows_of_learning() -> Iterator[Row]:
         distribution=bad("kind of object", "Gaussian", Categorical(), None),
         hidden=bad("kind of object", 64, "64", [1.5]) + bad("range", [0], [64, -1]),
     )
-    yield row(GridNetwork, width=POSITIVE)
+    yield row(GridNetwork)
     images = torch.zeros(5, 7, 7, 3)
     on_table = OnTable(grid, images)
     fits = array("longer runs single")
