@@ -74,6 +74,7 @@ def in_toy(patch: pytest.MonkeyPatch, root: Path) -> None:
     """The toy's own package, and no claims."""
     patch.setattr(sources, "PACKAGES", {"ipo": root / "ipo"})
     patch.setattr(claims, "write_fragments", lambda folder: None)
+    patch.setattr(first_page, "write_fragments", lambda folder: None)
     patch.setattr(printing, "chromium", lambda: None)
-    for page in (provenance, costs, first_page):
+    for page in (provenance, costs):
         patch.setattr(page, "write_fragment", lambda folder: None)
