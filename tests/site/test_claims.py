@@ -14,6 +14,7 @@ import scipy.stats
 from stored_rows import store_rows
 
 import claims
+import first_page
 from experiments.sealed import DamagedError
 from experiments.store import ResultsError, Store
 from rules import RULES, Finding
@@ -323,6 +324,22 @@ def test_the_first_page_shows_the_numbers_of_the_rows(data, tmp_path):
     assert "52.3<br>" in found  # the paper's
     assert "53.3<br>" in found  # ours, one higher
     assert "1 explained otherwise" in found
+
+
+def test_without_results_the_first_page_claims_nothing(empty, tmp_path):
+    first_page.write_fragments(tmp_path, empty)
+    text = (tmp_path / "_generated" / "finding.md").read_text(encoding="utf-8")
+    assert text.count(claims.NO_DATA) == 3
+    assert "image" not in text
+
+
+def test_the_picture_is_in_units_of_the_papers_advantage(data):
+    book = claims.read_claims(data)
+    shown = {row.label: row for row in first_page.advantages(book, data)}
+    adam, plain = shown["linear control, Adam"], shown["linear control, plain steps"]
+    assert adam.mean == pytest.approx(1)  # the rows have the paper's means
+    assert plain.mean == pytest.approx(0, abs=0.01)
+    assert len(shown) == 2  # of keys and doors there are no rows
 
 
 def test_the_page_of_claims_has_every_claim(data, tmp_path):
