@@ -12,7 +12,7 @@ KINDS = {"derive", "predict", "implement", "experiment", "criticise"}
 WITH_CODE = {"implement", "experiment"}
 LEVELS = ("easy", "medium", "hard")
 HEAD = re.compile(
-    r"```\{exercise\} (?P<title>.+) \((?P<kind>\w+), (?P<level>\w+), (?P<minutes>\d+) minutes.*\)\n"
+    r"```\{exercise\} (?P<title>.+): (?P<kind>\w+), (?P<level>\w+), (?P<minutes>\d+) minutes.*\n"
     r":label: (?P<label>\S+)\n"
 )
 SOLVED = re.compile(r"```\{solution\} (\S+)\n:label: \S+\n:class: dropdown\n")
