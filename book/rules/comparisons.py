@@ -45,7 +45,7 @@ def means_come_back(
         good.append(abs(ours.mean() - mean) <= max(num_errors * error, 0.5 * 10**-digits))
         name = f"{label(cell['method'])} on {cell['domain']}"
         parts.append(f"{name} {ours.mean():.3f} (paper {mean:.{digits}f})")
-    counts = f"{sum(good)} of {len(good)} come back: "
+    counts = f"{sum(good)} of {len(good)} are reproduced: "
     return Finding(together(map(holds, good)), counts + "; ".join(parts))
 
 

@@ -104,7 +104,7 @@ def hooks_are_robust(
     )
     found = scipy.stats.spearmanr(part, success)
     evidence = (
-        f"rank correlation over {len(part)} policies between the part of the hook's inside and "
+        f"rank correlation over {len(part)} policies between the share of the hook's inside and "
         f"success: {shown(found.statistic, '+.2f')}, p = {found.pvalue:.3f}"
     )
     clear = found.pvalue < 0.05  # and not NaN, as where all policies are alike

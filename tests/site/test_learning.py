@@ -45,8 +45,8 @@ def test_a_question_answers_to_the_keyboard(browser, built_site):
 
 
 def test_every_chapter_has_its_box_its_questions_and_terms(browser, built_site):
-    counts = """() => ['.frame', '.check', 'a[href*="glossary.html#term-"]'].map(
-        selector => document.querySelectorAll('.bd-article ' + selector).length)"""
+    counts = """() => ['.admonition.frame', '.admonition.check', '[href*="glossary.html#term"]']
+        .map(selector => document.querySelectorAll('.bd-article ' + selector).length)"""
     with new_context(browser) as context:
         page = context.new_page()
         for chapter in DECKS:

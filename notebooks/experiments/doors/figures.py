@@ -193,7 +193,7 @@ def median_strips(
 
 
 def torque(doors: pd.DataFrame, by_hand: pd.Series) -> Figure:
-    """Lever arms, and the part of the doors that one motor and the controller by hand open."""
+    """Lever arms, and the share of the doors that one motor and the controller by hand open."""
     fig, (left, right) = plt.subplots(1, 2, figsize=(9.5, 3.4))
     left.hist(doors["lever"], bins=np.arange(0.4, 1.25, 0.05), color="0.75")
     for friction, shade in zip((1.1, 1.5, 2.0), ("#56B4E9", "#0072B2", "black"), strict=True):
@@ -205,7 +205,7 @@ def torque(doors: pd.DataFrame, by_hand: pd.Series) -> Figure:
     right.plot(grid, enough, color="0.5", label="one motor is strong enough")
     right.plot(by_hand.index, by_hand, color="black", marker="o", ms=4, label="controller by hand")
     right.axvspan(min(TEST_FRICTIONS), max(TEST_FRICTIONS), color="0.93", zorder=0)
-    right.set(xlabel="friction [N m]", ylabel="part of the doors")
+    right.set(xlabel="friction [N m]", ylabel="share of the doors")
     right.legend(fontsize="small")
     return fig
 
@@ -275,7 +275,7 @@ def robustness(
             edgecolors=color(cell), label=NAMES[arm],
         )  # fmt: skip
     left.set(
-        xlabel=f"part of the pull by the hook's inside, friction {hard}",
+        xlabel=f"share of the pull by the hook's inside, friction {hard}",
         ylabel=f"opened at {hardest} [%]",
     )
     left.legend(fontsize="small")
