@@ -241,8 +241,12 @@ def ipo_variable_phi(
 
     def move_phi() -> None:
         nonlocal features
-        again = lambda: slope_in_phi(Phi @ problem.seen)  # noqa: E731
-        step(optimizer, slope_in_phi(features), again, settings.max_gradient_norm)
+        step(
+            optimizer,
+            slope_in_phi(features),
+            lambda: slope_in_phi(Phi @ problem.seen),
+            settings.max_gradient_norm,
+        )
         features = Phi @ problem.seen
         costs[:] = _costs_of_domains(problem, features)
 

@@ -20,8 +20,8 @@ pytestmark = pytest.mark.slow
 CHANGES = {
     "sign in a gradient": (
         "ipo/lqr.py",
-        "torch.bmm(P, M), alpha=-1)",
-        "torch.bmm(P, M), alpha=1)",
+        "torch.baddbmm(RF, B.mT,",
+        "torch.baddbmm(-RF, B.mT,",
         "lqr/curves",
     ),
     "order of draws": (
