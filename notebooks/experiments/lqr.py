@@ -34,7 +34,6 @@ from ipo.lqr_learners import LQR_METHODS, LQRSettings, published_lqr, train
 from ipo.stats import paired_difference, probability_of_improvement
 
 VALIDATION_INTERVAL = 20  # iterations between two looks at the held-out domain
-WITNESSED = {"weight_decay": 0.1, "dropout": 0.1, "variance_penalty": 1.0, "scale_penalty": 0.01}
 
 
 @checked
@@ -339,12 +338,6 @@ def short_if_small(cell: Cell) -> Cell | None:
     return short(cell) if cell.num_domains * cell.dim_distractor <= 2500 else None
 
 
-def short_of_one_weight(cell: Cell) -> Cell | None:
-    """The same, of one weight of each regulariser: others are of no other kind."""
-    is_one = any(getattr(cell.settings, name) == weight for name, weight in WITNESSED.items())
-    return short(cell) if is_one else None
-
-
 EXPERIMENTS = {
     name: Experiment(run_cell, Cell, short_if_small)
     for name in (
@@ -360,7 +353,7 @@ EXPERIMENTS = {
     "curves": Experiment(run_curve, Cell, short),
     "closed_loops": Experiment(run_closed_loops, Cell, short),
     "outside": Experiment(run_outside, Cell, short),
-    "regularized": Experiment(run_cell, Cell, short_of_one_weight),
+    "regularized": Experiment(run_cell, Cell, short),
 }
 
 

@@ -39,6 +39,7 @@ SMALLEST = {
         "train_colors": ["blue", "purple"],  # two are fewest
         "num_runs": 2,
         "num_runs_variants": 2,
+        "num_runs_regularized": 2,
         "num_runs_curves": 2,
         "num_runs_larger": 2,
         "num_runs_live": 1,
@@ -117,6 +118,7 @@ TOGETHER: dict[str, list[dict[str, Any]]] = {
         {"num_runs": 5},
         {"num_runs": 11, "num_runs_larger": 11},
         {"num_runs_variants": 5},
+        {"num_runs_regularized": 4},
         {"num_runs_curves": 4, "num_runs_live": 4},
         {"num_updates": 2, "num_updates_live": 2},
     ],

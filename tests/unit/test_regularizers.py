@@ -28,9 +28,9 @@ def test_the_rule_by_hand(losses, expected):
 
 
 def made_up(baseline: float, one: float) -> pd.DataFrame:
-    """Values of two runs of PPO, of IPO and of every arm of the grid; ``one`` of dropout 0.3."""
+    """Values of two runs of PPO, of IPO and of every arm of the grid; ``one`` of weight 10."""
     arms = dict.fromkeys([KEYS.baseline, KEYS.ipo, *KEYS.settings], (0.5, 0.4))
-    arms |= {KEYS.baseline: (baseline, 0.6), "ppo_dropout0.3": (one, 0.8)}
+    arms |= {KEYS.baseline: (baseline, 0.6), "ppo_scale_penalty10": (one, 0.8)}
     return pd.DataFrame(
         {"method": arm, "run": run, "training": training, "new": new + run / 10}
         for arm, (training, new) in arms.items()
@@ -39,17 +39,18 @@ def made_up(baseline: float, one: float) -> pd.DataFrame:
 
 
 def test_chosen_is_what_training_domains_choose():
-    assert KEYS.chosen(made_up(0.9, 0.89)) == dict.fromkeys(KEYS.grid, 0.0) | {"dropout": 0.3}
+    nothing = dict.fromkeys(KEYS.grid, 0.0)
+    assert KEYS.chosen(made_up(0.9, 0.89)) == nothing | {"scale_penalty": 10.0}
     assert not any(KEYS.chosen(made_up(0.9, 0.87)).values())
 
 
 def test_the_table_says_what_is_chosen_and_how_far_it_is_from_others():
     table = KEYS.table(made_up(0.9, 0.89)).set_index(["regulariser", "weight"])
-    row = table.loc["dropout", "0.3"]
+    row = table.loc["IRMv1", "10"]
     assert row["in training"] == "0.890 ± 0.000" and row["new domain"] == "0.850 ± 0.050"
     assert row["difference to none"] == "+0.200 [+0.200, +0.200]"
     assert row["difference to IPO"] == "+0.400 [+0.400, +0.400]"
-    assert table.index[table["chosen"] == "✓"].tolist() == [("dropout", "0.3")]
+    assert table.index[table["chosen"] == "✓"].tolist() == [("IRMv1", "10")]
 
 
 def test_arms_differ_from_the_published_baseline_in_one_setting_alone():
