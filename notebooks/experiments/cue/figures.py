@@ -1,13 +1,22 @@
-"""Figures of the cued maze: the task, and how long players wait for an answer."""
+"""Figures of the cued maze: the task, who waits for whom, and the phase diagram."""
 
 from __future__ import annotations
 
-import matplotlib.pyplot as plt
-import pandas as pd
-from matplotlib.figure import Figure
+from collections.abc import Sequence
 
+import matplotlib.pyplot as plt
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
+
+from experiments.cue.outcomes import NAMES
+from experiments.cue.theory import STRENGTH, Cues, text
 from experiments.figures import STYLES, draw_metric
 from ipo.worlds.cued_maze import LANDMARK
+
+OUTLINED = [withStroke(linewidth=3.5, foreground="black")]  # white on yellow can be seen
 
 
 def maze() -> Figure:
@@ -46,3 +55,59 @@ def waiting(runs: pd.DataFrame) -> Figure:
     ax.set(xlabel="gradient steps on each rollout", ylabel="return in the worst domain")
     ax.legend(fontsize=8)
     return fig
+
+
+def phases(worst: pd.Series, missed: pd.Series, points: Sequence[Cues]) -> Figure:
+    """Mean return in the worst domain at points of two domains, a map for each method.
+
+    Args:
+        worst: by ``cues, method``.
+        missed: by the same, whether something else was predicted; a cross stands there.
+    """
+    fig, axes = plt.subplots(1, len(NAMES), figsize=(11, 2.9))
+    for ax, (method, name) in zip(axes, NAMES.items(), strict=True):
+        picture = _draw(ax, points, worst.xs(method, level="method"))
+        _mark(ax, points, [cues for cues in points if missed[text(cues), method]])
+        if method != "vrex":
+            _draw_border(ax, points, method)
+        ax.set_title(name.replace(", ", ",\n"), fontsize=9)
+        ax.set_xlabel("$c_1$")
+    axes[0].set_ylabel("$c_2$")
+    fig.colorbar(picture, ax=axes, label="return in the worst domain", shrink=0.8)
+    return fig
+
+
+def _draw(ax: Axes, points: Sequence[Cues], worst: pd.Series):
+    """A square for each point, whose axes are the ranks of its cues."""
+    columns, rows = _ranks(points)
+    values = np.full((len(rows), len(columns)), np.nan)
+    for cues in points:
+        values[rows.index(cues[-1]), columns.index(cues[0])] = worst[text(cues)]
+    ax.grid(False)
+    ax.set_xticks(range(len(columns)), [f"{c:g}" for c in columns], fontsize=7)
+    ax.set_yticks(range(len(rows)), [f"{c:g}".replace("-", "−") for c in rows], fontsize=7)
+    return ax.imshow(values, cmap="cividis", vmin=0, vmax=LANDMARK, origin="lower", aspect="auto")
+
+
+def _mark(ax: Axes, points: Sequence[Cues], wrong: Sequence[Cues]) -> None:
+    columns, rows = _ranks(points)
+    for cues in wrong:
+        place = columns.index(cues[0]), rows.index(cues[-1])
+        ax.plot(*place, marker="x", color="white", ms=7, mew=2, path_effects=OUTLINED)
+
+
+def _ranks(points: Sequence[Cues]) -> tuple[list[float], list[float]]:
+    return sorted({cues[0] for cues in points}), sorted({cues[-1] for cues in points})
+
+
+def _draw_border(ax: Axes, points: Sequence[Cues], method: str) -> None:
+    """Where the rule of a method changes its mind, as far as it is in the diagram."""
+    columns, rows = _ranks(points)
+    first = np.linspace(columns[0], columns[-1], 500)
+    second = STRENGTH**2 / first if method == "ipo" else 2 * STRENGTH - first
+    inside = (second >= rows[0]) & (second <= first)
+    places = (
+        np.interp(values[inside], ranks, range(len(ranks)))
+        for values, ranks in ((first, columns), (second, rows))
+    )
+    ax.plot(*places, color="white", ls="--", lw=1.5, path_effects=OUTLINED)
