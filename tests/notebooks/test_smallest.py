@@ -53,7 +53,7 @@ SMALLEST = {
         "num_updates": 1,
         "num_updates_first": 1,
         "cues": [0.1, 0.5],
-        "more_cues": [0.1],
+        "more_cues": [0.6, 0.9],
     },
     "door": {
         "num_runs": 2,
@@ -123,7 +123,7 @@ TOGETHER: dict[str, list[dict[str, Any]]] = {
         {"num_updates": 2, "num_updates_live": 2},
     ],
     "cue": [
-        {"cues": [0.9, 0.1, 0.3], "more_cues": [1.0, 0.2]},
+        {"cues": [0.9, 0.1, 0.3], "more_cues": [0.9, 0.6]},
         {"cues": [0.2]},
         {"num_runs": 31},
         {"num_updates": 26, "num_workers": 2},

@@ -1,4 +1,4 @@
-"""Figures of the cued maze: the task, and phase diagrams."""
+"""Figures of the cued maze: the task, who waits for whom, and the phase diagram."""
 
 from __future__ import annotations
 
@@ -12,12 +12,11 @@ from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 
 from experiments.cue.outcomes import NAMES
-from experiments.cue.theory import GROUPS, STRENGTH, Cues, text
+from experiments.cue.theory import STRENGTH, Cues, text
 from experiments.figures import STYLES, draw_metric
 from ipo.worlds.cued_maze import LANDMARK
 
 OUTLINED = [withStroke(linewidth=3.5, foreground="black")]  # white on yellow can be seen
-GROUP_NAMES = {2: "two domains", 3: "two domains against one", 4: "three domains against one"}
 
 
 def maze() -> Figure:
@@ -58,30 +57,23 @@ def waiting(runs: pd.DataFrame) -> Figure:
     return fig
 
 
-def phases(worst: pd.Series, missed: pd.Series, diagrams: dict[int, Sequence[Cues]]) -> Figure:
-    """Mean return in the worst domain: a row for each diagram, a column for each method.
+def phases(worst: pd.Series, missed: pd.Series, points: Sequence[Cues]) -> Figure:
+    """Mean return in the worst domain at points of two domains, a map for each method.
 
     Args:
         worst: by ``cues, method``.
         missed: by the same, whether something else was predicted; a cross stands there.
-        diagrams: the points of each, by the number of domains.
     """
-    fig, axes = plt.subplots(
-        len(diagrams), len(NAMES), figsize=(11, 2.9 * len(diagrams)), squeeze=False
-    )
-    for row, (num, points) in zip(axes, diagrams.items(), strict=True):
-        for ax, (method, name) in zip(row, NAMES.items(), strict=True):
-            picture = _draw(ax, points, worst.xs(method, level="method"))
-            wrong = [cues for cues in points if missed[text(cues), method]]
-            _mark(ax, points, wrong)
-            if method != "vrex":
-                _draw_border(ax, points, method)
-            ax.set_title(name.replace(", ", ",\n"), fontsize=9)
-            ax.set_xlabel("$c_1$")
-        row[0].set_ylabel(f"{GROUP_NAMES[num]}\n$c_{num}$")
-    fig.colorbar(
-        picture, ax=axes, label="return in the worst domain", shrink=0.7 / len(diagrams) ** 0.5
-    )
+    fig, axes = plt.subplots(1, len(NAMES), figsize=(11, 2.9))
+    for ax, (method, name) in zip(axes, NAMES.items(), strict=True):
+        picture = _draw(ax, points, worst.xs(method, level="method"))
+        _mark(ax, points, [cues for cues in points if missed[text(cues), method]])
+        if method != "vrex":
+            _draw_border(ax, points, method)
+        ax.set_title(name.replace(", ", ",\n"), fontsize=9)
+        ax.set_xlabel("$c_1$")
+    axes[0].set_ylabel("$c_2$")
+    fig.colorbar(picture, ax=axes, label="return in the worst domain", shrink=0.8)
     return fig
 
 
@@ -111,16 +103,11 @@ def _ranks(points: Sequence[Cues]) -> tuple[list[float], list[float]]:
 def _draw_border(ax: Axes, points: Sequence[Cues], method: str) -> None:
     """Where the rule of a method changes its mind, as far as it is in the diagram."""
     columns, rows = _ranks(points)
-    num = len(points[0])
-    first, second = GROUPS[num]
-    cue = np.linspace(columns[0], columns[-1], 500)
-    other = (num * STRENGTH - first * cue) / second
-    if method == "ipo":
-        other = STRENGTH**2 / cue if num == 2 else np.linspace(rows[0], rows[-1], len(cue))
-        cue = cue if num == 2 else np.full_like(cue, STRENGTH)
-    inside = (other >= rows[0]) & (other <= (cue if num == 2 else rows[-1]))
+    first = np.linspace(columns[0], columns[-1], 500)
+    second = STRENGTH**2 / first if method == "ipo" else 2 * STRENGTH - first
+    inside = (second >= rows[0]) & (second <= first)
     places = (
         np.interp(values[inside], ranks, range(len(ranks)))
-        for values, ranks in ((cue, columns), (other, rows))
+        for values, ranks in ((first, columns), (second, rows))
     )
     ax.plot(*places, color="white", ls="--", lw=1.5, path_effects=OUTLINED)

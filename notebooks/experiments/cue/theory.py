@@ -54,9 +54,9 @@ def disputed(values: Sequence[float]) -> list[Cues]:
     return [c for c in points(2, values) if c[0] > STRENGTH and c[1] < -STRENGTH]
 
 
-def contested(values: Sequence[float]) -> list[Cues]:
-    """Points of two domains where the game is predicted to help."""
-    return [c for c in points(2, values) if pooled(c) == CUE_WINS and game(c) == LANDMARK_WINS]
+def contested(num_domains: int, values: Sequence[float]) -> list[Cues]:
+    """Points at which pooled training and the game are predicted to follow different signs."""
+    return [cues for cues in points(num_domains, values) if pooled(cues) != game(cues)]
 
 
 # -------------------------------------------------------------------------------- the rules
