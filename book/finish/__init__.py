@@ -17,11 +17,7 @@ from finish.tables import keep_intervals
 
 def finish(html: Path) -> None:
     """Equations and icons become part of the pages, and what no page needs goes."""
-    paths = {path.name: path for path in sorted(html.glob("*.html"))}
-    pages = {
-        name: BeautifulSoup(path.read_text(encoding="utf-8"), "html.parser")
-        for name, path in paths.items()
-    }
+    pages = read_pages(html)
     remove_source_maps(html)
     set_equations(pages)
     draw_icons(pages, html)
@@ -31,4 +27,18 @@ def finish(html: Path) -> None:
         keep_intervals(page)
         add_downloads(page)
         make_lean(name, page)
-        paths[name].write_text(str(page), encoding="utf-8")
+    write_pages(html, pages)
+
+
+def read_pages(folder: Path) -> dict[str, BeautifulSoup]:
+    """The pages in a folder, by the names of their files."""
+    return {
+        path.name: BeautifulSoup(path.read_text(encoding="utf-8"), "html.parser")
+        for path in sorted(folder.glob("*.html"))
+    }
+
+
+def write_pages(folder: Path, pages: dict[str, BeautifulSoup]) -> None:
+    """Put changed pages back."""
+    for name, page in pages.items():
+        (folder / name).write_text(str(page), encoding="utf-8")
