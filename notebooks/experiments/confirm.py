@@ -43,9 +43,10 @@ from experiments.work import finished
 
 CONFIRMED = DATA / "confirmed.json"
 CHAOTIC = (
-    *("keys/main", "keys/variants", "keys/larger", "keys/curves"),
-    *("algorithm/players", "door/curves", "door/gaps"),
-    *("cue/two_domains", "cue/three_domains", "cue/four_domains", "cue/encodings"),
+    *("keys/main", "keys/turns", "keys/variants", "keys/larger", "keys/curves"),
+    *("keys/in_full", "keys/regularized", "algorithm/players", "door/curves", "door/gaps"),
+    *("cue/many_steps", "cue/varied", "cue/encodings"),
+    *("cue/two_domains", "cue/three_domains", "cue/four_domains"),
 )
 LEVEL, MANY = 0.001, 5
 UNREST = 2.0  # times what runs move by before the end: a little more than where they were stopped
