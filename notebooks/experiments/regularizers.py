@@ -8,8 +8,8 @@ grids, before anything was trained: the largest weight that does no harm there. 
 lower by 0.02 than the best of the grid's, no regulariser included, and a cost higher by 1 %.
 
 The grids below are those parts of the declared ones that have been run. The others were, on keys,
-weight decay 0.1 and 1, dropout 0.1 and 0.3, V-REx 1, 10 and 100; in LQR weight decay 0.01, 0.1 and
-1, dropout 0.1 and 0.3, V-REx 0.01 and 100, IRMv1 0.0001, 0.01 and 1.
+weight decay 0.1 and 1, dropout 0.1 and 0.3, V-REx 1, 10 and 100; in LQR V-REx 0.01 and 100, IRMv1
+0.0001, 0.01 and 1.
 """
 
 from __future__ import annotations
@@ -117,7 +117,11 @@ KEYS = Trial(
 LQR = Trial(
     "gradient_descent",
     "ipo_fixed_phi",
-    {"variance_penalty": (1.0,)},
+    {
+        "weight_decay": (0.01, 0.1, 1.0),
+        "dropout": (0.1, 0.3),
+        "variance_penalty": (1.0,),
+    },
     np.log,
     allowed=np.log(1.01),
     digits=1,
