@@ -2,7 +2,8 @@
 
 ``colored_keys`` (MiniGrid), and ``tabular``, which turns them into tables; ``cued_maze``, which is
 one; ``door`` (MuJoCo), ``many_doors`` side by side, and about them ``hooking``, a controller by
-hand, and ``pulling``, the rule that tells how a door was pulled. Each brings its packages as an extra: ``ipo[keys,door]``.
+hand, and ``pulling``, the rule that tells how a door was pulled. Each brings its packages
+as an extra: ``ipo[keys,door]``.
 """
 
 from __future__ import annotations
