@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from experiments import causality, keys, lqr, own_domains
+from experiments import causality, keys, keys_labels, lqr, own_domains
 from experiments.doors import success as door
 from experiments.experiment import Experiment, Places
 from experiments.games import scalar as algorithm
@@ -15,7 +15,7 @@ from ipo.checks import check_choice
 DATA = ROOT / "data"
 CHAPTERS: dict[str, dict[str, Experiment]] = {
     "lqr": lqr.EXPERIMENTS,
-    "keys": keys.EXPERIMENTS,
+    "keys": keys.EXPERIMENTS | keys_labels.EXPERIMENTS,
     "causality": causality.EXPERIMENTS,
     "algorithm": algorithm.EXPERIMENTS,
     "door": door.EXPERIMENTS,
