@@ -219,7 +219,7 @@ def table(rows: pd.DataFrame) -> pd.DataFrame:
             "agreement": means["agreement"],
             "smaller domain": means["smaller_domain"],
             "return on grey": {m: mean_and_std(runs_of(rows, m, TESTED), 3) for m in NAMES},
-            "− given labels": {m: gap(rows, m, "ipo") for m in NAMES if m != "ipo"},
+            "− given labels": {m: gap(rows, m, "ipo") if m != "ipo" else "" for m in NAMES},
         }
     ).loc[list(NAMES)]
 
