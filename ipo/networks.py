@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ipo.checks import Count, checked
+from ipo.checks import Count, Positive, checked
 from ipo.distributions import Categorical, Distribution, Gaussian, Generators
 from ipo.game import average
 
@@ -229,21 +229,25 @@ class GridNetwork(Network):
     Args:
         num_channels: of the image; 3 for MiniGrid's codes of object, colour and state.
         num_actions: A.
+        width: of all layers, relative to the published ones; sqrt(2) has twice as many weights.
     """
 
     distribution = Categorical
     phi = ("conv1", "conv2", "conv3")
 
     @checked
-    def __init__(self, num_channels: Count = 3, num_actions: Count = 7) -> None:
+    def __init__(
+        self, num_channels: Count = 3, num_actions: Count = 7, width: Positive = 1.0
+    ) -> None:
+        few, some, many = (round(width * units) for units in (16, 32, 64))
         self.shapes = {
-            "conv1": (4 * num_channels, 16),
-            "conv2": (4 * 16, 32),
-            "conv3": (4 * 32, 64),
-            "actor1": (64, 64),
-            "actor2": (64, num_actions),
-            "critic1": (64, 64),
-            "critic2": (64, 1),
+            "conv1": (4 * num_channels, few),
+            "conv2": (4 * few, some),
+            "conv3": (4 * some, many),
+            "actor1": (many, many),
+            "actor2": (many, num_actions),
+            "critic1": (many, many),
+            "critic2": (many, 1),
         }
 
     def _draw(self, generator: np.random.Generator) -> dict[str, np.ndarray]:

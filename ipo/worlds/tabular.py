@@ -182,7 +182,10 @@ class TabularDomains:
 
 
 class TabularEnvironments:
-    """``[R, N]`` copies that begin anew when they end: ``rollouts.Environments``."""
+    """``[R, N]`` copies that begin anew when they end: ``rollouts.Environments``.
+
+    Their ``domains`` are ``[N]``, or ``[R, N]`` where runs have others.
+    """
 
     def __init__(
         self, table: TabularDomains, domains: np.ndarray, generators: Sequence[np.random.Generator]
@@ -215,7 +218,8 @@ class TabularEnvironments:
         )
 
     def _starts(self) -> np.ndarray:
-        uniform = np.stack([generator.random(len(self.domains)) for generator in self.generators])
+        num_copies = self.domains.shape[-1]
+        uniform = np.stack([generator.random(num_copies) for generator in self.generators])
         drawn = np.searchsorted(self.table.starts, self.domains + uniform, side="right")
         # The sums are rounded: a draw next to 0 or 1 could lead into the next domain.
         return np.clip(
@@ -235,6 +239,13 @@ def expected_return(task: TabularTask, policy: Policies) -> tuple[np.ndarray, np
     Returns:
         returns ``[P]`` and success probabilities ``[P]``, over the starts of the task.
     """
+    returns, success = values(task, policy)
+    return task.start @ returns, task.start @ success
+
+
+@checked
+def values(task: TabularTask, policy: Policies) -> tuple[np.ndarray, np.ndarray]:
+    """V_0 of :func:`expected_return` and the probability of success, ``[S, P]`` each."""
     chosen = policy[:, task.observation].transpose(2, 1, 0)  # [A, S, P]
     scores = (chosen * task.goal.T[..., None]).sum(0)
     goes_on = np.tile(chosen * ~task.done.T[..., None], 2)  # for return and success side by side
@@ -244,7 +255,7 @@ def expected_return(task: TabularTask, policy: Policies) -> tuple[np.ndarray, np
         for probability, next_state in zip(goes_on, task.next_state.T, strict=True):
             earlier += probability * value[next_state]
         value = earlier
-    returns, success = np.split(task.start @ value, 2)
+    returns, success = np.split(value, 2, axis=1)
     return returns, success
 
 

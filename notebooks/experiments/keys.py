@@ -23,10 +23,10 @@ from experiments.rows import tidy
 from experiments.tables import mean_and_std
 from experiments.tabulated import load_or_tabulate
 from experiments.visits import occupancy, reach
-from ipo.checks import Count, check_choice, check_choices, checked, one_of
+from ipo.checks import Count, Positive, check_choice, check_choices, checked, one_of
 from ipo.distributions import Categorical
 from ipo.networks import GridNetwork, OnTable, Weights
-from ipo.ppo import PPOSettings, Training
+from ipo.ppo import MakeEnvironments, PPOSettings, Training
 from ipo.stats import paired_difference, probability_of_improvement
 from ipo.worlds.colored_keys import COLORS, ColoredKeysEnv
 from ipo.worlds.tabular import (
@@ -68,6 +68,7 @@ class Cell:
         color_encoding: what the network sees of a colour: MiniGrid's ``integer``, a ``one_hot``
             code, or ``none``.
         size: of the grid.
+        width: of the networks, relative to the published ones.
     """
 
     label: str
@@ -75,6 +76,7 @@ class Cell:
     train_colors: tuple[str, ...] = TRAINED
     color_encoding: Annotated[str, one_of(ENCODINGS)] = "integer"
     size: Count = 5
+    width: Positive = 1.0
 
     def __post_init__(self) -> None:
         check_file_name("label", self.label)  # of policies
@@ -106,10 +108,11 @@ def arm(
     train_colors: tuple[str, ...] = TRAINED,
     color_encoding: str = "integer",
     size: int = 5,
+    width: float = 1.0,
     **changes: Any,
 ) -> Cell:
     """An arm of the experiment: the published settings, but for what is named."""
-    return Cell(label, published(method, **changes), train_colors, color_encoding, size)
+    return Cell(label, published(method, **changes), train_colors, color_encoding, size, width)
 
 
 # Arms by label, as tables name them.
@@ -165,6 +168,21 @@ def turn_arms(num_updates: int, train_colors: Sequence[str] = TRAINED) -> list[C
     ]
 
 
+def fair_arms(num_updates: int, train_colors: Sequence[str] = TRAINED) -> list[Cell]:
+    """PPO with as many weights as IPO's two players; three quarters of the data from one colour.
+
+    As with the doors, the players' minibatches differ in size then, and not in number.
+    """
+    of = partial(arm, train_colors=tuple(train_colors), num_updates=num_updates)
+    unequal = {"num_envs": (36, 12)}
+    return [
+        of("ppo_wide", "ppo", width=2**0.5),
+        of("ppo_wide_lr5e-4", "ppo", width=2**0.5, learning_rate=5e-4),
+        of("ppo_75_25", "ppo", **unequal),
+        of("ipo_75_25", "ipo", num_minibatches=12, **unequal),
+    ]
+
+
 def with_a_third(train_colors: Sequence[str]) -> tuple[str, ...]:
     """Training colours and the first of the others."""
     return (*train_colors, next(color for color in COLORS if color not in train_colors))
@@ -180,6 +198,19 @@ def setting_names(train_colors: Sequence[str]) -> dict[str, str]:
         "ipo_3colors": f"IPO, {three}",
         "ppo_normalized": "PPO, advantages normalised",
         "ipo_normalized": "IPO, advantages normalised",
+    }
+
+
+def fair_names(train_colors: Sequence[str]) -> dict[str, str]:
+    """Names of the arms with a larger network and with unequal shares, by label."""
+    most = f"three quarters in {train_colors[0]}"
+    return {
+        "ppo": "PPO, as published",
+        "ppo_wide": "PPO, as many weights as IPO",
+        "ppo_wide_lr5e-4": "PPO, as many weights, IPO's learning rate",
+        "ppo_75_25": f"PPO, {most}",
+        "ipo": "IPO, as published",
+        "ipo_75_25": f"IPO, {most}",
     }
 
 
@@ -232,7 +263,7 @@ def run_cell(
     made_for = {"cell": cell, "seeds": seeds[:NUM_SAVED]}
     if saves:
         check_place(policy_path(policies, cell), made_for)
-    task = Keys(tables, cell.color_encoding, cell.size)
+    task = Keys(tables, cell.color_encoding, cell.size, cell.width)
     *_, (_, players) = task.train(cell, seeds)
     if saves:
         first = [{name: w[:NUM_SAVED] for name, w in player.items()} for player in players]
@@ -267,21 +298,39 @@ def curve(
 
 
 class Keys:
-    """The tabulated task in all colours, for one encoding of colours and one size."""
+    """The tabulated task in all colours, for one encoding of colours, one size and width."""
 
-    def __init__(self, tables: str | Path, color_encoding: str = "integer", size: int = 5) -> None:
+    def __init__(
+        self,
+        tables: str | Path,
+        color_encoding: str = "integer",
+        size: int = 5,
+        width: float = 1.0,
+    ) -> None:
         self.color_encoding = color_encoding
         self.tasks = {
             color: load_or_tabulate(ColoredKeysEnv, tables, size=size, color=color)
             for color in COLORS
         }
-        self.network = GridNetwork(encode(self.tasks["red"].images, color_encoding).shape[-1])
+        num_channels = encode(self.tasks["red"].images, color_encoding).shape[-1]
+        self.network = GridNetwork(num_channels, width=width)
 
     def train(self, cell: Cell, seeds: list[int]) -> Iterator[tuple[int, list[Weights]]]:
         """:meth:`ipo.ppo.Training.reports` in the cell's training colours."""
         domains = TabularDomains([self.tasks[color] for color in cell.train_colors])
-        network = OnTable(self.network, encode(domains.images, self.color_encoding))
-        return Training(network, domains, len(cell.train_colors), cell.settings, seeds).reports()
+        return self.train_in(domains, domains.images, len(cell.train_colors), cell, seeds)
+
+    def train_in(
+        self,
+        domains: MakeEnvironments,
+        images: np.ndarray,
+        num_domains: int,
+        cell: Cell,
+        seeds: list[int],
+    ) -> Iterator[tuple[int, list[Weights]]]:
+        """The same in domains that are not colours; they index ``images [K, 7, 7, 3]``."""
+        network = OnTable(self.network, encode(images, self.color_encoding))
+        return Training(network, domains, num_domains, cell.settings, seeds).reports()
 
     def logits(self, players: Sequence[Weights], images: np.ndarray) -> torch.Tensor:
         """Of the average policy ``[R, K, A]`` for MiniGrid's ``images [K, 7, 7, 3]``.
@@ -445,7 +494,7 @@ EXPERIMENTS = (
     }
     | {
         name: Experiment(run_rows, Cell, short, runs_at_once=25)
-        for name in ("in_full", "regularized")
+        for name in ("in_full", "regularized", "fair")
     }
     | {
         "curves": Experiment(run_curve, Cell, short, runs_at_once=25),

@@ -256,7 +256,7 @@ def rows_of_learning() -> Iterator[Row]:
         distribution=bad("kind of object", "Gaussian", Categorical(), None),
         hidden=bad("kind of object", 64, "64", [1.5]) + bad("range", [0], [64, -1]),
     )
-    yield row(GridNetwork)
+    yield row(GridNetwork, width=POSITIVE)
     images = torch.zeros(5, 7, 7, 3)
     on_table = OnTable(grid, images)
     fits = array("longer runs single")
@@ -594,7 +594,7 @@ def rows_of_worlds() -> Iterator[Row]:
     wrong = bad("probability", 2 * policy, policy - [1, -1], np.zeros((3, 2, 2)))
     policies = lambda good: array("runs")(good) + wrong  # noqa: E731
     at = {"task": task, "policy": policy}
-    for function in (tabular.expected_return, visits.occupancy):
+    for function in (tabular.expected_return, tabular.values, visits.occupancy):
         yield row(function, at, policy=policies)
     states = np.zeros(len(task.start), bool)
     yield row(visits.reach, at | {"states": states}, policy=policies, states=array("nan inf"))

@@ -1,7 +1,7 @@
 """The coloured-keys experiment: its protocol by hand, what networks see, and the shipped data."""
 
 import json
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +12,8 @@ import torch
 from minigrid.core.constants import OBJECT_TO_IDX
 
 from experiments import keys as experiment
-from experiments import keys_in_full, regularizers
-from experiments.experiment import filled, rebuilt
+from experiments import keys_in_full, keys_labels, regularizers
+from experiments.experiment import filled, plain, rebuilt
 from experiments.keys import (
     EXPERIMENTS,
     Cell,
@@ -317,6 +317,13 @@ SHIPPED = {
     },
     "regularized": {(label, TWO, "integer", 5): 25 for label in regularizers.KEYS.settings},
     "curves": {(method, TWO, "integer", 5): 30 for method in ("ppo", "ipo", "ensemble")},
+    "fair": {
+        (method, TWO, "integer", 5): 50
+        for method in ("ppo_wide", "ppo_wide_lr5e-4", "ppo_75_25", "ipo_75_25")
+    },
+    "labels": {
+        (f"ipo_{labels}", TWO, "integer", 5): 50 for labels in ("clustered", "inferred", "random")
+    },
 }
 CELLS = [(name, *cell) for name, cells in SHIPPED.items() for cell in cells]
 LEARNING_RATES = {
@@ -324,6 +331,7 @@ LEARNING_RATES = {
     "ipo": 5e-4,
     "ensemble": 5e-4,
     "ppo_lr5e-4": 5e-4,
+    "ppo_wide_lr5e-4": 5e-4,
     "ipo_lr1e-3": 1e-3,
     "in_turn": 5e-4,
     "in_turn_lr1e-3": 1e-3,
@@ -337,7 +345,8 @@ def shipped() -> dict[str, pd.DataFrame]:
 
 def test_every_shipped_file_is_tested_here():
     assert {path.stem for path in RESULTS.glob("*.csv")} == SHIPPED.keys() | {"grids"}
-    assert EXPERIMENTS.keys() == SHIPPED.keys() | {"grids"}
+    both = EXPERIMENTS | keys_labels.EXPERIMENTS
+    assert both.keys() == SHIPPED.keys() | {"grids"}
 
 
 @pytest.mark.parametrize("name", SHIPPED)
@@ -345,6 +354,14 @@ def test_every_shipped_run_is_there_with_every_metric_in_every_color(shipped, na
     rows = shipped[name]
     counted = rows.groupby(CELL)["run"].agg(lambda runs: sorted(set(runs)))
     assert counted.to_dict() == {cell: list(range(n)) for cell, n in SHIPPED[name].items()}
+    if name == "labels":
+        about = rows[rows["domain"] == "train"]
+        assert about.groupby("metric")["run"].count().to_dict() == {
+            "agreement": 150,
+            "smaller_domain": 150,
+        }
+        assert about["value"].between(0, 1).all()
+        rows = rows[rows["domain"] != "train"]
     metrics = EXACT if name == "curves" else EXACT | {"return_published_protocol"}
     keys = [column for column in rows.columns if column != "value"]
     assert not rows.duplicated(keys).any()
@@ -369,15 +386,22 @@ def settings_of(label: str, color_encoding: str) -> dict:
     learning_rate = LEARNING_RATES.get(label, LEARNING_RATES[method])
     normalize = "minibatch" if label.endswith("_normalized") else "none"
     settings = published(method, learning_rate=learning_rate, normalize_advantages=normalize)
-    return asdict(replace(settings, num_updates=80 if label.endswith("_long") else 20))
+    if label.endswith("_75_25"):
+        settings = replace(settings, num_envs=(36, 12))
+        if method == "ipo":
+            settings = replace(settings, num_minibatches=12)
+    return plain(replace(settings, num_updates=80 if label.endswith("_long") else 20))
 
 
 @pytest.mark.parametrize("name", ["main", "turns", "variants", "larger", "curves"])
 def test_shipped_rows_are_of_the_published_settings(name):
     for batch in batches(name):
         label, encoding = batch["columns"]["method"], batch["columns"]["color_encoding"]
-        assert filled(Cell, batch["cell"])["settings"] == settings_of(label, encoding)
-        assert "+".join(batch["cell"]["train_colors"]) == batch["columns"]["train_colors"]
+        cell = batch["cell"]["trained"] if name == "labels" else batch["cell"]
+        assert filled(Cell, cell)["settings"] == settings_of(label, encoding)
+        assert "+".join(cell["train_colors"]) == batch["columns"]["train_colors"]
+        wide = 2**0.5 if "wide" in label else 1
+        assert cell.get("width", 1) == pytest.approx(wide)  # older rows do not say it
 
 
 @pytest.mark.parametrize("name", SHIPPED)
@@ -412,8 +436,7 @@ def test_shipped_curves_end_where_the_shipped_runs_end(shipped):
 
 # ------------------------------------------------------------------------ shipped policies
 
-WITHOUT_POLICIES = ("curves", "in_full", "regularized")
-POLICY_CELLS = [cell for cell in CELLS if cell[0] not in WITHOUT_POLICIES]
+POLICY_CELLS = [cell for cell in CELLS if cell[0] not in ("curves", "fair", "labels")]
 
 
 def test_every_arm_ships_its_policies():
@@ -490,13 +513,14 @@ def test_shipped_policies_have_every_shipped_metric(shipped, keys_of, method):
         ("main", experiment.main_arms(20)),
         ("variants", experiment.variant_arms(20)),
         ("larger", experiment.larger_arms(20, 6)),
-        ("in_full", keys_in_full.full_arms(20)),
-        ("regularized", regularizers.keys_arms(20)),
+        ("fair", experiment.fair_arms(20)),
+        ("labels", keys_labels.label_cells(20)),
     ],
 )
 def test_arms_of_the_chapter_are_those_of_the_shipped_rows(name, arms):
-    cells = {json.dumps(filled(Cell, batch["cell"])) for batch in batches(name)}
-    assert {json.dumps(asdict(cell)) for cell in arms} == cells
+    kind = type(arms[0])
+    cells = {json.dumps(filled(kind, batch["cell"])) for batch in batches(name)}
+    assert {json.dumps(plain(cell)) for cell in arms} == cells
     assert len(arms) == len(SHIPPED[name])
 
 
@@ -504,7 +528,8 @@ def test_every_arm_of_a_table_has_a_name():
     labels = {name: {cell[0] for cell in cells} for name, cells in SHIPPED.items()}
     assert experiment.MAIN.keys() == labels["main"]
     assert experiment.LARGER.keys() == labels["larger"]
-    assert keys_in_full.NAMES.keys() == labels["in_full"] | {"ipo"}
+    assert experiment.fair_names(("red", "green")).keys() == labels["fair"] | {"ppo", "ipo"}
+    assert keys_labels.NAMES.keys() == labels["labels"] | {"ipo", "ensemble"}
     others = {arm for arm in labels["variants"] if arm.endswith(("3colors", "normalized"))}
     assert experiment.setting_names(experiment.TRAINED).keys() == others | {"ppo", "ipo"}
 

@@ -92,3 +92,10 @@ def test_the_most_likely_actions_fail_on_grey_and_the_door_is_where(rows, method
 def test_at_equal_learning_rates_ipo_is_behind(rows):
     for ipo, ppo in (("ipo", "ppo_lr5e-4"), ("ipo_lr1e-3", "ppo")):
         assert runs(rows, ipo).mean() < runs(rows, ppo).mean()
+
+
+def test_neither_method_finds_the_colours():
+    rows = pd.read_csv(RESULTS / "labels.csv")
+    agreement = rows[rows["metric"] == "agreement"].groupby("method")["value"].mean()
+    assert agreement["ipo_clustered"] == 0
+    assert agreement["ipo_inferred"] < 0.25

@@ -46,6 +46,16 @@ def constant_player(logits: list[float], value: float) -> Weights:
 # ------------------------------------------------------------------- the grid network
 
 
+def test_a_wider_network_has_twice_as_many_weights():
+    """A player alone that is as large as two; with one width, the published layers."""
+
+    def count(width: float) -> int:
+        return sum(math.prod(shape) for shape in GridNetwork(width=width).weight_shapes.values())
+
+    assert count(1) == 19_384
+    assert count(math.sqrt(2)) == pytest.approx(2 * count(1), rel=0.01)
+
+
 @given(
     seed=st.integers(0, 1000),
     num_channels=st.integers(1, 8),

@@ -26,6 +26,7 @@ from ipo.worlds.colored_keys import COLORS, ColoredKeysEnv
 from ipo.worlds.tabular import (
     NotTabularError,
     TabularDomains,
+    TabularEnvironments,
     TabularTask,
     expected_return,
     optimal_policy,
@@ -292,6 +293,22 @@ def test_domains_share_one_table_of_images(keys, order):
         assert np.array_equal(domains.images[own], keys[color].images)
     seen = np.concatenate([keys[color].images[keys[color].observation] for color in order])
     assert np.array_equal(domains.images[domains.observation], seen)
+
+
+def test_runs_may_have_domains_of_their_own(keys):
+    """Run 0 has two copies in red, run 1 one in each domain; both draw what they would draw."""
+    domains = TabularDomains([keys["red"], keys["green"]])
+
+    def starts(chosen: list, *seeds: int) -> np.ndarray:
+        generators = [np.random.default_rng(seed) for seed in seeds]
+        copies = TabularEnvironments(domains, np.array(chosen), generators)
+        copies.reset()
+        return copies.state
+
+    together = starts([[0, 0], [0, 1]], 3, 4)
+    alone = [starts([0, 0], 3)[0], starts([0, 1], 4)[0]]
+    assert np.array_equal(together, alone)
+    assert (together >= 520).tolist() == [[False, False], [False, True]]
 
 
 def test_copies_do_not_depend_on_other_runs(keys):
