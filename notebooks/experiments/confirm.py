@@ -44,7 +44,8 @@ from experiments.work import finished
 CONFIRMED = DATA / "confirmed.json"
 CHAOTIC = (
     *("keys/main", "keys/turns", "keys/variants", "keys/larger", "keys/curves"),
-    *("keys/in_full", "keys/regularized", "algorithm/players", "door/curves", "door/gaps"),
+    *("keys/in_full", "keys/regularized", "keys/fair", "keys/labels", "algorithm/players"),
+    *("door/curves", "door/gaps"),
     *("cue/many_steps", "cue/varied", "cue/encodings"),
     *("cue/two_domains", "cue/three_domains", "cue/four_domains"),
 )

@@ -28,10 +28,13 @@ Values = Annotated[pd.Series, _check_values]  # of runs; infinite ones are told 
 
 @checked
 def show(frame: pd.DataFrame, formats: dict[str, str] | str | None = None) -> Styler:
-    """A table without its index; ``formats`` of its numbers, by column; ``p`` is a p value."""
+    """A table without its index; ``formats`` of its numbers, by column; ``p`` is a p value.
+
+    A number that there is not is a dash.
+    """
     for column in formats if isinstance(formats, dict) else ():
         check_choice("formats", column, frame.columns)
-    style = frame.style.format(formats)
+    style = frame.style.format(formats, na_rep="–")
     if "p" in frame.columns:
         style = style.format(_p_value, subset=["p"])
     return style.hide().set_table_attributes('class="dataframe"')

@@ -156,13 +156,13 @@ def notable(found: pd.DataFrame, shown: Sequence[str]) -> pd.DataFrame:
     """The lines in which IPO was predicted, or found, to differ, with some columns of means."""
     own = found[(found[["predicted", "verdict"]] != "alike").any(axis=1)]
     interval = [
-        f"[{low:+.2f}, {high:+.2f}]" for low, high in zip(own["low"], own["high"], strict=True)
+        f"[{low:+.3f}, {high:+.3f}]" for low, high in zip(own["low"], own["high"], strict=True)
     ]
     return pd.DataFrame(
         {
             "cues": own["cues"].str.replace("-", "−"),
             **{name: own[name].map("{:.2f}".format) for name in shown},
-            "difference": own["mean"].map("{:+.2f}".format),
+            "difference": own["mean"].map("{:+.3f}".format),
             "95 % interval": interval,
             "predicted": own["predicted"],
             "found": own["verdict"],
