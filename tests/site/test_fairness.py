@@ -101,6 +101,11 @@ def test_the_sentences_on_keys():
         ("Normalisation of rewards", "advantages normalised in both"),
     ):
         assert interval("keys", aspect, name)[1] < 0
+    for aspect, name in (
+        ("Network size", "against PPO with as many"),
+        ("Weights of the domains", "three quarters of the frames in red"),
+    ):
+        assert interval("keys", aspect, name)[0] > 0
 
 
 def test_the_sentence_on_doors():

@@ -162,8 +162,8 @@ def notable(found: pd.DataFrame, shown: Sequence[str]) -> pd.DataFrame:
         {
             "cues": own["cues"].str.replace("-", "−"),
             **{name: own[name].map("{:.2f}".format) for name in shown},
-            "difference": own["mean"].map("{:+.3f}".format),
-            "95 % interval": interval,
+            "difference": own["mean"].map("{:+.3f}".format).str.replace("-", "−"),
+            "95 % interval": [text.replace("-", "−") for text in interval],
             "predicted": own["predicted"],
             "found": own["verdict"],
         }
