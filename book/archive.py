@@ -22,12 +22,17 @@ SOLUTIONS = ("notebooks/exercises", "tests/teaching")
 DATE = (2020, 1, 1, 0, 0, 0)  # so that the same files make the same archive
 
 
-def write_archive(root: Path, target: Path) -> None:
-    """Everything that builds the book, without solutions of coding exercises."""
+def write_archive(root: Path, target: Path, packages: Path) -> None:
+    """Everything that builds the book, without solutions of coding exercises.
+
+    What is made of those for students, in the folder ``packages``, comes along in their place.
+    """
+    files = {path.relative_to(root): path for path in sources(root)}
+    files |= {Path("book", packages.name, path.name): path for path in packages.glob("*.zip")}
     target.parent.mkdir(parents=True, exist_ok=True)
     with zipfile.ZipFile(target, "w") as archive:
-        for path in sources(root):
-            entry = zipfile.ZipInfo(f"{INSIDE}/{path.relative_to(root).as_posix()}", DATE)
+        for name, path in sorted(files.items()):
+            entry = zipfile.ZipInfo(f"{INSIDE}/{name.as_posix()}", DATE)
             entry.external_attr = 0o644 << 16
             entry.compress_type = zipfile.ZIP_DEFLATED
             archive.writestr(entry, path.read_bytes(), compresslevel=6)

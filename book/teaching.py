@@ -42,7 +42,12 @@ def main() -> int:
 
 
 def write_download(source: Path, build: Path) -> None:
-    """The students' package for the site in ``source``; kept in ``build`` while it is current."""
+    """The students' package for the site in ``source``; kept in ``build`` while it is current.
+
+    A copy of the book's source that has no solutions comes with the package.
+    """
+    if not SOURCES.exists():
+        return
     target = build / "teaching"
     target.mkdir(exist_ok=True)
     archive, made_of = target / f"{NAMES[write_student]}.zip", target / "made_of"

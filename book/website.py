@@ -78,7 +78,8 @@ def stage(root: Path, source: Path, notebooks: list[Notebook], profile: str) -> 
     claims.write_fragments(source)
     for name, page in GENERATED.items():
         write_fragment(source, name, page.overview())
-    archive.write_archive(root, source / "extra" / archive.NAME)
+    teaching.write_download(source, source.parent)
+    archive.write_archive(root, source / "extra" / archive.NAME, source / "_downloads")
     tables = {
         "fairness": fairness.table(),
         "hyperparameters": hyperparameters.tables(),
@@ -90,7 +91,6 @@ def stage(root: Path, source: Path, notebooks: list[Notebook], profile: str) -> 
     for name, text in tables.items():
         write_fragment(source, name, text)
     reading_time.write_fragments(source, notebooks)
-    teaching.write_download(source, source.parent)
     first_page.write_fragments(source)
 
 

@@ -84,3 +84,9 @@ def test_the_download_is_made_once(tmp_path, monkeypatch):
         teaching.write_download(site, tmp_path)
     assert len(made) == 2
     assert len({(site / "_downloads" / "ipo-exercises.zip").read_bytes() for site in sites}) == 1
+
+
+def test_a_copy_without_solutions_brings_the_package(tmp_path, monkeypatch):
+    monkeypatch.setattr(teaching, "SOURCES", tmp_path / "left out")
+    teaching.write_download(tmp_path / "site", tmp_path)
+    assert not list(tmp_path.iterdir())

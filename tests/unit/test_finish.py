@@ -107,11 +107,15 @@ def test_the_archive_has_the_sources_and_no_solutions(tmp_path):
     for folder in archive.SOLUTIONS:
         (root / folder).mkdir(parents=True)
         (root / folder / "solved.py").write_text("x")
-    archive.write_archive(root, tmp_path / "a.zip")
+    packages = tmp_path / "_downloads"
+    packages.mkdir()
+    (packages / "exercises.zip").write_text("x")
+    archive.write_archive(root, tmp_path / "a.zip", packages)
     names = zipfile.ZipFile(tmp_path / "a.zip").namelist()
-    assert names == [f"{archive.INSIDE}/{name}" for name in ("Makefile", "ipo/a.py")]
+    inside = ("Makefile", "book/_downloads/exercises.zip", "ipo/a.py")
+    assert names == [f"{archive.INSIDE}/{name}" for name in inside]
     before = (tmp_path / "a.zip").read_bytes()
-    archive.write_archive(root, tmp_path / "a.zip")
+    archive.write_archive(root, tmp_path / "a.zip", packages)
     assert (tmp_path / "a.zip").read_bytes() == before
 
 
