@@ -9,9 +9,9 @@ from small import assert_close, assert_near
 from experiments.games import played as games_played
 from experiments.games import scalar as algorithm
 from experiments.games.played import Game, Gap, Steps, Trajectory, Vote
-from experiments.games.regressions import effect_of_target
 from experiments.games.scalar import Cell, problem_cell
 from experiments.games.scalar_control import stationary_cost
+from ipo.causality.regressions import effect_of_target
 from ipo.causality.small_games import GameSettings, play, vote
 
 RULE = GameSettings("ipo", learning_rate=0.1, num_rounds=40)

@@ -33,12 +33,12 @@ from experiments import lqr as lqr_experiments
 from experiments.chapter import Chapter
 from experiments.doors import hooking, pulling, success, training
 from experiments.experiment import Experiment
-from experiments.games import regressions, scalar_control
+from experiments.games import scalar_control
 from experiments.pictures import DoorPicture
 from experiments.store import Store
 from experiments.witness import side_by_side
 from ipo import game, lqr, lqr_learners, optimizers, own_domains, ppo, rollouts, stats
-from ipo.causality import icp, predictors, scm, small_games
+from ipo.causality import icp, predictors, regressions, scm, small_games
 from ipo.distributions import Categorical
 from ipo.networks import DenseNetwork, DenseOnTable, GridNetwork, OnTable, copied
 from ipo.own_domains import copies, networks
@@ -657,6 +657,7 @@ def rows_of_experiments() -> Iterator[Row]:
         {"label": "ppo", "settings": settings},
         label=bad("kind of object", 3),
         train_colors=bad("choice", ("red", "gren"), ("red", "red")) + bad("sample size", ()),
+        width=POSITIVE,
     )
     trained = {"label": "ppo", "settings": settings, "saved_after": (1,)}
     yield row(

@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from small import assert_close, assert_near
 
-from experiments.games.regressions import correlated_noise, effect_of_target
 from ipo.causality.predictors import PredictorSettings, Regression, irm_objective
+from ipo.causality.regressions import correlated_noise, effect_of_target
 from ipo.causality.small_games import (
     GameSettings,
     downhill,

@@ -17,10 +17,10 @@ from torch import Tensor
 
 from experiments.experiment import Experiment
 from experiments.games import scalar_control
-from experiments.games.regressions import correlated_noise, effect_of_target
 from experiments.rows import tidy
 from experiments.store import select
 from ipo.causality.predictors import PredictorSettings, Regression, irm_objective
+from ipo.causality.regressions import correlated_noise, effect_of_target
 from ipo.causality.small_games import (
     GameSettings,
     gap,
