@@ -47,7 +47,12 @@ def themed(browser, viewport: dict, mode: str):
     return context
 
 
+STILL = "*, ::before, ::after { animation: none !important; transition: none !important }"
+
+
 def found_by_axe(page, folds_open: bool) -> list[str]:
+    """What is wrong; colours are those that stay when folds have come up."""
+    page.add_style_tag(content=STILL)
     if folds_open:
         page.evaluate(OPEN)
     page.evaluate(AXE)
