@@ -6,10 +6,6 @@ the variance of returns or costs (V-REx) and their slope in a factor on the poli
 How strong a regulariser is comes from training domains alone, by a rule that was fixed, with the
 grids, before anything was trained: the largest weight that does no harm there. A return may be
 lower by 0.02 than the best of the grid's, no regulariser included, and a cost higher by 1 %.
-
-The grids below are those parts of the declared ones that have been run. The others were, on keys,
-weight decay 0.1 and 1, dropout 0.1 and 0.3, V-REx 1, 10 and 100; in LQR V-REx 0.01 and 100, IRMv1
-0.0001, 0.01 and 1.
 """
 
 from __future__ import annotations
@@ -109,7 +105,12 @@ class Trial:
 KEYS = Trial(
     "ppo",
     "ipo",
-    {"scale_penalty": (1.0, 10.0, 100.0)},
+    {
+        "weight_decay": (0.1, 1.0),
+        "dropout": (0.1, 0.3),
+        "variance_penalty": (1.0, 10.0, 100.0),
+        "scale_penalty": (1.0, 10.0, 100.0),
+    },
     operator.neg,
     allowed=0.02,
     digits=3,
@@ -120,7 +121,8 @@ LQR = Trial(
     {
         "weight_decay": (0.01, 0.1, 1.0),
         "dropout": (0.1, 0.3),
-        "variance_penalty": (1.0,),
+        "variance_penalty": (0.01, 1.0, 100.0),
+        "scale_penalty": (0.0001, 0.01, 1.0),
     },
     np.log,
     allowed=np.log(1.01),
