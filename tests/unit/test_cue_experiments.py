@@ -17,7 +17,6 @@ from experiments.paper import read_paper
 from experiments.store import Store, asked
 from ipo.causality.small_games import GameSettings, last
 from ipo.game import average
-from ipo.rollouts import Rollout
 from ipo.worlds.cued_maze import cued_maze
 from ipo.worlds.tabular import TabularDomains, expected_return
 
@@ -118,33 +117,12 @@ def tiny(method="ppo", cues=(0.9, -0.9), **more):
     return training.Cell(settings, cues, **more)
 
 
-def rollout_with(returns: torch.Tensor) -> Rollout:
-    """Of which only returns and advantages matter, the latter all 1."""
-    return Rollout(*[torch.ones_like(returns)] * 5, returns)
-
-
-def test_vrex_weighs_domains_by_the_gradient_of_its_objective():
-    """Two runs, two domains of two copies, one step; returns of 0.8 and 0.4, and of 0.5 each."""
-    learner = training.VREx(3.0, *arguments(tiny(penalty=3.0), [0, 1]))
-    returns = torch.tensor([[0.7, 0.9, 0.3, 0.5], [0.5] * 4]).unsqueeze(-1)
-    found = learner.weighted(rollout_with(returns)).advantages.squeeze(-1)
-    expected = torch.tensor([[-0.2, -0.2, 2.2, 2.2], [1.0] * 4])  # 1 - 2 * 3 * (+-0.2)
-    torch.testing.assert_close(found, expected)
-
-
-def arguments(cell, seeds):
-    domains = TabularDomains([cued_maze(cue) for cue in cell.cues])
-    return training.network(cell.encoding), domains, len(cell.cues), cell.settings, seeds
-
-
-def test_vrex_without_a_penalty_worth_the_name_is_ppo():
-    with_penalty = training.run_cell(tiny(penalty=1e-12), [0, 1])
+def test_vrex_is_ppo_with_a_penalty_on_the_variance_of_returns():
+    *_, cell = training.phase_cells([(0.9, -0.9)], 2)
+    assert cell.columns["method"] == "vrex_100" and cell.settings.method == "ppo"
+    almost_none = replace(tiny().settings, variance_penalty=1e-12)
+    with_penalty = training.run_cell(replace(tiny(), settings=almost_none), [0, 1])
     np.testing.assert_allclose(with_penalty["value"], training.run_cell(tiny(), [0, 1])["value"])
-
-
-def test_a_penalty_is_of_ppo_alone():
-    with pytest.raises(ValueError, match=r"^penalty = 1\.0: must be None"):
-        tiny("ipo", penalty=1.0)
 
 
 @pytest.mark.parametrize("encoding", training.ENCODINGS)

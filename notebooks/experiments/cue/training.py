@@ -13,10 +13,9 @@ import torch
 from experiments.cue.theory import PENALTIES, Cues, text
 from experiments.experiment import Experiment
 from experiments.rows import tidy
-from ipo.checks import Positive, checked, one_of
+from ipo.checks import checked, one_of
 from ipo.networks import DenseOnTable, Weights
 from ipo.ppo import PPOSettings, Training
-from ipo.rollouts import Rollout
 from ipo.worlds.cued_maze import Cue, cued_maze
 from ipo.worlds.tabular import TabularDomains, expected_return
 
@@ -35,21 +34,16 @@ class Cell:
         cues: of the training domains.
         encoding: what the network sees: landmark, cue and whether it is at the junction as numbers
             (``signs``), or which of the eight observations it is (``one_hot``).
-        penalty: of V-REx; ``None``: there is none.
     """
 
     settings: PPOSettings
     cues: Annotated[tuple[Cue, ...], "domains"]
     encoding: Annotated[str, one_of(ENCODINGS)] = "signs"
-    penalty: Positive | None = None
-
-    def __post_init__(self) -> None:
-        if self.penalty is not None and self.settings.method != "ppo":
-            raise ValueError(f"penalty = {self.penalty}: must be None, but for the method ppo")
 
     @property
     def columns(self) -> dict[str, Any]:
-        method = self.settings.method if self.penalty is None else f"vrex_{self.penalty:g}"
+        penalty = self.settings.variance_penalty
+        method = f"vrex_{penalty:g}" if penalty else self.settings.method
         return {"method": method, "cues": text(self.cues), "encoding": self.encoding}
 
 
@@ -97,7 +91,7 @@ def phase_cells(points: Sequence[Cues], num_updates: int) -> list[Cell]:
         for cues in points
         for cell in (
             *(Cell(one_step(method, num_updates), cues) for method in METHODS),
-            *(Cell(ppo, cues, penalty=float(p)) for p in PENALTIES),
+            *(Cell(replace(ppo, variance_penalty=float(p)), cues) for p in PENALTIES),
         )
     ]
 
@@ -133,41 +127,10 @@ def varied_cells(cues: Cues, num_updates: int) -> list[Varied]:
     ]
 
 
-class VREx(Training):
-    """PPO on the mean return of the domains minus a penalty times its variance::
-
-        J = mean_d R_d - penalty Var_d R_d,
-        grad J = mean_d [1 - 2 penalty (R_d - mean R)] grad R_d
-
-    So each domain's advantages get a weight. R_d is estimated by the mean of the returns in its
-    part of the rollout. Source: Krueger et al. (2021), with returns in place of risks.
-    """
-
-    def __init__(self, penalty: float, *given: Any) -> None:
-        super().__init__(*given)
-        self.penalty, self.num_domains = penalty, len(self.moves[0].domains)
-
-    def weighted(self, rollout: Rollout) -> Rollout:
-        """Of ``[R, N, T]``, whose copies are in the order of their domains, evenly many of each."""
-        by_domain = rollout.returns.unflatten(1, (self.num_domains, -1))
-        returns = by_domain.mean((2, 3), keepdim=True)  # [R, E, 1, 1]
-        weights = 1 - 2 * self.penalty * (returns - returns.mean(1, keepdim=True))
-        advantages = rollout.advantages.view_as(by_domain) * weights
-        return rollout._replace(advantages=advantages.flatten(1, 2))
-
-    def respond(self, d: int) -> None:
-        """PPO's only move, with these weights."""
-        average = self.network.frozen(self.players)
-        rollout = self.collectors[d].collect(average, self.network.distribution, self.draws)
-        self.num_frames += rollout.values[0].numel()
-        self.improve(self.moves[d].player, self.weighted(rollout).frames())
-
-
 def training(cell: Cell, seeds: list[int]) -> Training:
     """Runs of a cell that have not begun."""
     domains = TabularDomains([cued_maze(cue) for cue in cell.cues])
-    given = (network(cell.encoding), domains, len(cell.cues), cell.settings, seeds)
-    return Training(*given) if cell.penalty is None else VREx(cell.penalty, *given)
+    return Training(network(cell.encoding), domains, len(cell.cues), cell.settings, seeds)
 
 
 def network(encoding: str) -> DenseOnTable:
