@@ -19,7 +19,7 @@ Then, as you need them:
     own_domains     the same for environments of your own
     notebooks       misspelt parameters of a notebook
     causality       causal models, invariant predictors, IRM-Games, ICP, games of two numbers
-    worlds          coloured keys and doors
+    worlds          coloured keys, a maze, doors, and networks for tables of what is seen
 
 Import what you need (``from ipo import lqr``); nothing heavy is imported here. The environments
 are registered with gymnasium: ``gymnasium.make("ipo/ColoredKeys-v0", color="grey")``.

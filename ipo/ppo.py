@@ -33,7 +33,6 @@ from ipo.distributions import Categorical, Distribution, Generators
 from ipo.game import Move, moves, play_round
 from ipo.networks import (
     Network,
-    OnTable,
     Outputs,
     PullBack,
     Weights,
@@ -199,7 +198,7 @@ class Training:
     @checked
     def __init__(
         self,
-        network: Network | OnTable,
+        network: Network,
         make_environments: MakeEnvironments,
         num_domains: Count,
         settings: PPOSettings,
@@ -412,9 +411,7 @@ class Training:
         return [*self.draws, *self.resets, *self.orders, *self.dropouts]
 
 
-def _check_needs(
-    network: Network | OnTable, owned: Sequence[Sequence[int]], settings: PPOSettings
-) -> None:
+def _check_needs(network: Network, owned: Sequence[Sequence[int]], settings: PPOSettings) -> None:
     for name in ("variable_phi", "dropout"):
         if getattr(settings, name) and not network.phi:
             raise ValueError(f"{name} = {getattr(settings, name)}: needs a network that has a phi")

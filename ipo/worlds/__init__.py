@@ -1,8 +1,8 @@
 """The worlds that policies act in.
 
 ``colored_keys`` (MiniGrid), and ``tabular``, which turns them into tables; ``cued_maze``, which is
-one; ``door`` (MuJoCo), and ``many_doors`` side by side. Each brings its packages as an extra:
-``ipo[keys,door]``.
+one, and ``networks`` for tables; ``door`` (MuJoCo), and ``many_doors`` side by side. Each brings
+its packages as an extra: ``ipo[keys,door]``.
 """
 
 from __future__ import annotations

@@ -25,10 +25,11 @@ from experiments.tabulated import load_or_tabulate
 from experiments.visits import occupancy, reach
 from ipo.checks import Count, Positive, check_choice, check_choices, checked, one_of
 from ipo.distributions import Categorical
-from ipo.networks import GridNetwork, OnTable, Weights
+from ipo.networks import Weights
 from ipo.ppo import MakeEnvironments, PPOSettings, Training
 from ipo.stats import paired_difference, probability_of_improvement
 from ipo.worlds.colored_keys import COLORS, ColoredKeysEnv
+from ipo.worlds.networks import GridNetwork, OnTable
 from ipo.worlds.tabular import (
     TabularDomains,
     TabularTask,

@@ -9,7 +9,8 @@ from torch import Tensor
 
 from ipo.lqr import LQR, sample_problem
 from ipo.lqr_learners import LQRSettings, train
-from ipo.networks import GridNetwork, Outputs, Weights
+from ipo.networks import Outputs, Weights
+from ipo.worlds.networks import GridNetwork
 
 
 def paper_problem(

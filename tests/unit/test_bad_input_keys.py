@@ -20,10 +20,11 @@ from experiments.keys import Cell, encode, published, run_cell
 from experiments.policies import load_policy, save_policy
 from experiments.sealed import DamagedError, write_sealed
 from experiments.tabulated import load_or_tabulate
-from ipo.networks import GridNetwork, Weights
+from ipo.networks import Weights
 from ipo.ppo import PPOSettings, Training
 from ipo.rollouts import FromGymnasium
 from ipo.worlds.colored_keys import ColoredKeysEnv
+from ipo.worlds.networks import GridNetwork
 from ipo.worlds.tabular import NotTabularError
 
 # -------------------------------------------------------------------------- environment

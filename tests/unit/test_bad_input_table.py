@@ -40,10 +40,11 @@ from experiments.witness import side_by_side
 from ipo import game, lqr, lqr_learners, optimizers, own_domains, ppo, rollouts, stats
 from ipo.causality import icp, predictors, regressions, scm, small_games
 from ipo.distributions import Categorical
-from ipo.networks import DenseNetwork, DenseOnTable, GridNetwork, OnTable, copied
+from ipo.networks import DenseNetwork, copied
 from ipo.own_domains import copies, networks
 from ipo.own_domains import policy as policies
 from ipo.worlds import colored_keys, cued_maze, door, many_doors, tabular
+from ipo.worlds.networks import DenseOnTable, GridNetwork, OnTable
 
 NAN, INF = math.nan, math.inf
 
@@ -734,8 +735,9 @@ TRUSTING = {
     r"ipo\.lqr\.(LQR\.to|split_domains)": "torch's own conversion and view, by a new name",
     r"ipo\.lqr_learners\.Learner": RECORD,
     r"ipo\.lqr_learners\.regularized_cost": LOOP,
-    r"ipo\.networks\.\w+\.(__call__|after_pooling|vjp)": LOOP,
+    r"ipo\.(worlds\.)?networks\.\w+\.(__call__|after_pooling|vjp)": LOOP,
     r"ipo\.networks\.(averaged|chosen_rows|dense|in_one_row|vjp|Tanh.*)": LOOP,
+    r"ipo\.worlds\.networks\.OnTable\.start": "hands on what it is given",
     r"ipo\.networks\.(inputs_and_output|slopes_of_layers)": LOOP,
     r"ipo\.networks\.(dropout_factors|vjp_with_dropout)": LOOP,
     r"ipo\.penalties\..*": LOOP,

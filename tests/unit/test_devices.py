@@ -9,8 +9,9 @@ from other_device import DEVICE, OtherDevice
 from test_training import SMALL, Counting
 
 from ipo.distributions import Categorical, Gaussian
-from ipo.networks import DenseNetwork, GridNetwork, OnTable
+from ipo.networks import DenseNetwork
 from ipo.ppo import PPOSettings, Training
+from ipo.worlds.networks import GridNetwork, OnTable
 
 SETTINGS = PPOSettings(
     "ipo", normalize_rewards=True, normalize_advantages="minibatch", **(SMALL | {"num_steps": 8})

@@ -33,8 +33,8 @@ from experiments.policies import load_policy
 from experiments.store import Batch, Store
 from experiments.tables import beside_shipped
 from experiments.visits import occupancy
-from ipo.networks import GridNetwork
 from ipo.worlds.colored_keys import COLORS
+from ipo.worlds.networks import GridNetwork
 from ipo.worlds.tabular import TabularTask, expected_return
 
 DATA = Path(__file__).resolve().parents[2] / "data"

@@ -7,7 +7,8 @@ import torch
 
 from experiments.figures import network_graph
 from ipo.distributions import Categorical
-from ipo.networks import DenseNetwork, GridNetwork
+from ipo.networks import DenseNetwork
+from ipo.worlds.networks import GridNetwork
 
 NETWORKS = {
     "grid": (GridNetwork(), (1, 2, 7, 7, 3)),

@@ -13,16 +13,8 @@ from torch import Tensor
 
 from experiments.policies import load_policy, save_policy
 from ipo.distributions import Categorical
-from ipo.networks import (
-    DenseNetwork,
-    DenseOnTable,
-    GridNetwork,
-    Network,
-    OnTable,
-    Weights,
-    copied,
-    in_one_row,
-)
+from ipo.networks import DenseNetwork, Network, Weights, copied, in_one_row
+from ipo.worlds.networks import DenseOnTable, GridNetwork, OnTable
 
 
 def generators(*seeds: int) -> list[np.random.Generator]:

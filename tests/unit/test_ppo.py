@@ -22,7 +22,7 @@ from torch import Tensor
 from experiments.keys import published
 from ipo.distributions import Categorical, Gaussian
 from ipo.game import moves
-from ipo.networks import GridNetwork, OnTable, Weights, copied
+from ipo.networks import Weights, copied
 from ipo.ppo import (
     METHODS,
     PPOSettings,
@@ -41,6 +41,7 @@ from ipo.rollouts import (
     value_errors,
 )
 from ipo.worlds.colored_keys import ColoredKeysEnv
+from ipo.worlds.networks import GridNetwork, OnTable
 from ipo.worlds.tabular import TabularDomains, expected_return, optimal_policy, tabulate
 
 SMALL = {

@@ -14,9 +14,10 @@ from experiments.cue.theory import PENALTIES, Cues, text
 from experiments.experiment import Experiment
 from experiments.rows import tidy
 from ipo.checks import checked, one_of
-from ipo.networks import DenseOnTable, Weights
+from ipo.networks import Weights
 from ipo.ppo import PPOSettings, Training
 from ipo.worlds.cued_maze import Cue, cued_maze
+from ipo.worlds.networks import DenseOnTable
 from ipo.worlds.tabular import TabularDomains, expected_return
 
 ENCODINGS = ("signs", "one_hot")

@@ -18,8 +18,9 @@ from experiments.experiment import Experiment
 from experiments.keys import Keys, encode
 from experiments.rows import tidy
 from ipo.game import nash_gap
-from ipo.networks import OnTable, Weights, copied
+from ipo.networks import Weights, copied
 from ipo.ppo import Training
+from ipo.worlds.networks import OnTable
 from ipo.worlds.tabular import TabularDomains, optimal_policy
 
 
