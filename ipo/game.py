@@ -24,7 +24,7 @@ import torch
 from torch import Tensor
 
 from ipo.checks import Count, Positive, check_count, checked, one_of
-from ipo.optimizers import Slope, step
+from ipo.optimizers import Slope, differentiate, step
 
 GAMES = ("pooled", "ipo", "ensemble", "in_turn")
 ORDERS = ("in_turn", "together")
@@ -103,9 +103,7 @@ def slope(cost: Cost, policy: Tensor, share: float = 1.0) -> Slope:
     if isinstance(cost, WithSlope):
         return cost.slope(policy, share)
     policy = policy.detach().requires_grad_()
-    costs = cost(policy)
-    # The runs do not interact: the gradient of their sum holds the gradient of each.
-    return costs.detach(), torch.autograd.grad(share * costs.sum(), policy)
+    return differentiate(cost(policy), [policy], share)
 
 
 class LinearPlayers:

@@ -173,7 +173,8 @@ def regularized_cost(
 
     The derivative, at w = 1, is a central difference: the gradient of a cost is analytic and cannot
     be differentiated again. With ``dropout`` an observation is left out with that probability,
-    drawn anew in each step, and what is left is scaled up.
+    drawn anew in each step, and what is left is scaled up. Where a closed loop is unstable the
+    whole is infinite.
 
     Sources: Krueger et al. (2021) for V-REx, Arjovsky et al. (2019) for IRMv1.
     """
@@ -189,7 +190,7 @@ def regularized_cost(
         more, less = (_costs((1 + change) * K, problem) for change in (SCALED_BY, -SCALED_BY))
         slopes = (more - less) / (2 * SCALED_BY)
         total = total + settings.scale_penalty * slopes.square().mean(1)
-    return total
+    return torch.where(total.isfinite(), total, torch.inf)
 
 
 @checked

@@ -53,13 +53,26 @@ def descend(
     spent on gradients that are not used.
     """
     leaves = _leaves(optimizer)
+    step(
+        optimizer,
+        differentiate(objective(), leaves),
+        lambda: differentiate(objective(), leaves),
+        max_gradient_norm,
+    )
 
-    def slope() -> Slope:
-        costs = objective()
-        # The runs do not interact: the gradient of their sum holds the gradient of each.
-        return costs.detach(), torch.autograd.grad(costs.sum(), leaves)
 
-    step(optimizer, slope(), slope, max_gradient_norm)
+def differentiate(costs: Tensor, leaves: Sequence[Tensor], share: float = 1.0) -> Slope:
+    """Costs ``[runs]`` and ``share`` times their gradient in leaves ``[runs, ...]``, by autograd.
+
+    A run whose cost is infinite has no way down: its gradient is 0.
+    """
+    # The runs do not interact: the gradient of their sum holds the gradient of each.
+    gradients = torch.autograd.grad(share * costs.sum(), leaves)
+    lost = costs.detach().isinf()
+    return costs.detach(), [
+        gradient.masked_fill(lost.view(-1, *[1] * (gradient.dim() - 1)), 0.0)
+        for gradient in gradients
+    ]
 
 
 def step(

@@ -84,8 +84,8 @@ class Trial:
             return {
                 "regulariser": NAMES[name],
                 "weight": f"{weight:g}",
-                "in training": mean_and_std(runs["training"], self.digits),
-                "new domain": mean_and_std(runs["new"], self.digits),
+                "in training": self.spread(runs["training"]),
+                "new domain": self.spread(runs["new"]),
                 "difference to none": self.gap(values, name, weight, self.baseline),
                 "difference to IPO": self.gap(values, name, weight, self.ipo),
                 "chosen": "✓" if weight == chosen[name] else "",
@@ -94,10 +94,19 @@ class Trial:
         grid = self.grid.items()
         return pd.DataFrame([row(name, weight) for name, own in grid for weight in own])
 
+    def spread(self, runs: pd.Series) -> str:
+        """Mean ± standard deviation, or in how many runs a cost is infinite."""
+        lost = np.isinf(runs)
+        if lost.any():
+            return f"infinite in {lost.sum()} of {len(runs)} runs"
+        return mean_and_std(runs, self.digits)
+
     def gap(self, values: pd.DataFrame, name: str, weight: float, other: str) -> str:
         """In the new domain to another arm, paired by run, with its 95 % interval, in words."""
         pair = [values.loc[arm, "new"] for arm in (self.label(name, weight), other)]
         both = pd.concat(pair, axis=1, join="inner")
+        if np.isinf(both).any(axis=None):
+            return "–"
         mean, low, high, _ = paired_difference(both.iloc[:, 0], both.iloc[:, 1])
         return f"{mean:+.{self.digits}f} [{low:+.{self.digits}f}, {high:+.{self.digits}f}]"
 
@@ -122,7 +131,7 @@ LQR = Trial(
         "weight_decay": (0.01, 0.1, 1.0),
         "dropout": (0.1, 0.3),
         "variance_penalty": (0.01, 1.0, 100.0),
-        "scale_penalty": (0.0001, 0.01),  # 1 was declared, too: its training diverges
+        "scale_penalty": (0.0001, 0.01, 1.0),
     },
     np.log,
     allowed=np.log(1.01),

@@ -8,7 +8,7 @@ import pytest
 import torch
 from small import assert_close, paper_problem, random_gain
 
-from experiments import keys, regularizers
+from experiments import keys, lqr, regularizers
 from experiments.regularizers import KEYS, largest_harmless
 from ipo.lqr import training_costs
 from ipo.lqr_learners import LQRSettings, published_lqr, regularized_cost, train
@@ -125,3 +125,12 @@ def test_runs_of_lqr_do_not_mix(name):
 def test_other_methods_have_no_regularizers():
     with pytest.raises(ValueError, match=r"dropout = 0\.1: is for gradient_descent alone"):
         LQRSettings("ipo_fixed_phi", dropout=0.1)
+
+
+def test_a_run_that_leaves_the_stable_set_stays_out_and_its_cost_says_so():
+    cell = regularizers.lqr_cells(2, 20, 10)[-1]
+    rows = lqr.run_cell(cell, list(range(10)))
+    values = regularizers.lqr_values(rows)
+    lost = np.isinf(values["training"])
+    assert 0 < lost.sum() < len(lost)
+    assert regularizers.LQR.spread(values["training"]) == f"infinite in {lost.sum()} of 10 runs"
