@@ -9,7 +9,6 @@ An evening's reading, in this order:
     distributions   what a network's outputs say of actions
     networks        policies and critics, and the average of several players' outputs
     rollouts        experience in many environments at once, and advantages
-    penalties       on what differs between domains, as V-REx and IRMv1 have them
     ppo             PPO, IPO and the ensemble: that game between networks
     stats           intervals and comparisons over runs
     checks          errors that name the parameter, its value and the rule
@@ -40,7 +39,6 @@ __all__ = [
     "notebooks",
     "optimizers",
     "own_domains",
-    "penalties",
     "ppo",
     "rollouts",
     "stats",

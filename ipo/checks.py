@@ -131,15 +131,19 @@ def one_of(choices: Iterable[str]) -> Callable[[str, object], None]:
 
 
 def checked(function: Function) -> Function:
-    """The same function, or class, which first applies the rules of its signature."""
+    """The same function, or dataclass, which first applies the rules of its signature."""
     if isinstance(function, type):
-        function.__init__ = checked(function.__init__)  # type: ignore[misc]
+        function.__init__ = _with_rules(function.__init__, function)  # type: ignore[misc]
         return function
+    return _with_rules(function, function)
+
+
+def _with_rules(function: Function, declared_by: Callable[..., Any]) -> Function:
     signature = inspect.getfullargspec(function)
 
     @functools.wraps(function)
     def entry(*arguments: Any, **named: Any) -> Any:
-        rules = _rules(function)
+        rules = _rules(declared_by)
         by_place = zip(signature.args, arguments, strict=False)
         others = rules.get(signature.varkw or "", Any)
         _check_all(
@@ -203,6 +207,8 @@ NUMBERS: dict[Any, Callable[..., None]] = {
 @functools.cache
 def _rules(function: Callable[..., Any]) -> dict[str, Any]:
     """Of the parameters; what is returned may have a type that is not imported."""
+    if isinstance(function, type):  # each field by the names of the module that declares it
+        return typing.get_type_hints(function, include_extras=True)
     own = {name: rule for name, rule in function.__annotations__.items() if name != "return"}
     declared = types.SimpleNamespace(__annotations__=own)
     return typing.get_type_hints(declared, function.__globals__, include_extras=True)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Annotated
 
 import numpy as np
@@ -22,11 +21,10 @@ from ipo.checks import (
     Positive,
     Seeds,
     check_checkpoints,
-    check_number,
     checked,
     one_of,
 )
-from ipo.game import Cost, LinearPlayers, Order, play_round
+from ipo.game import LinearPlayers, Order, play_round
 from ipo.lqr import (
     LQR,
     Gains,
@@ -40,8 +38,6 @@ from ipo.optimizers import OPTIMIZERS, Slope, descend, make_optimizer, step
 
 LQR_METHODS = ("gradient_descent", "overparameterized", "ipo_fixed_phi", "ipo_variable_phi")
 LQR_CONTROLS = ("in_turn", "ensemble")
-REGULARIZERS = ("variance_penalty", "scale_penalty", "dropout")
-SCALED_BY = 0.01  # a gain, to see how its cost changes
 Method = Annotated[str, one_of((*LQR_METHODS, *LQR_CONTROLS))]
 
 
@@ -61,8 +57,6 @@ class LQRSettings:
         phi_scale: standard deviation of the initial entries of Phi (not published).
         gain_scale: the same for the controllers behind Phi (not published).
         order: of the players of ``ipo_fixed_phi``: ``in_turn`` (Algorithm 1) or ``together``.
-        variance_penalty, scale_penalty, dropout: of ``gradient_descent``, which lowers
-            :func:`regularized_cost` where one of them is not 0.
     """
 
     method: Method
@@ -75,18 +69,6 @@ class LQRSettings:
     phi_scale: NonNegative = 0.001
     gain_scale: NonNegative = 0.001
     order: Order = "in_turn"
-    variance_penalty: NonNegative = 0.0
-    scale_penalty: NonNegative = 0.0
-    dropout: Annotated[float, partial(check_number, least=0, below=1)] = 0.0
-
-    def __post_init__(self) -> None:
-        for name in REGULARIZERS:
-            if getattr(self, name) and self.method != "gradient_descent":
-                raise ValueError(f"{name} = {getattr(self, name)}: is for gradient_descent alone")
-
-    @property
-    def regularized(self) -> bool:
-        return any(getattr(self, name) for name in REGULARIZERS)
 
 
 @checked
@@ -154,43 +136,11 @@ def gradient_descent(
 ) -> Learner:
     """One player that owns all domains: gradient descent on the pooled cost of K."""
     player = _players(settings, start, num_players=1)
-    cost: Cost = PooledCost(problem, problem.seen)
-    if settings.regularized:
-        streams = [np.random.default_rng(np.random.SeedSequence(s).spawn(2)[1]) for s in seeds]
-        cost = lambda K: regularized_cost(K, problem, settings, streams)  # noqa: E731
+    cost = PooledCost(problem, problem.seen)
     return Learner(
         iterate=lambda: player.round([cost]),
         gain=lambda: player.policy,
     )
-
-
-def regularized_cost(
-    K: Tensor, problem: LQR, settings: LQRSettings, generators: Sequence[np.random.Generator]
-) -> Tensor:
-    """What gains ``[R, n_u, n_o]`` are to lower instead of the pooled cost, ``[R]``::
-
-        mean_d J_d + variance_penalty var_d J_d + scale_penalty mean_d (d J_d(w K) / d w)^2
-
-    The derivative, at w = 1, is a central difference: the gradient of a cost is analytic and cannot
-    be differentiated again. With ``dropout`` an observation is left out with that probability,
-    drawn anew in each step, and what is left is scaled up. Where a closed loop is unstable the
-    whole is infinite.
-
-    Sources: Krueger et al. (2021) for V-REx, Arjovsky et al. (2019) for IRMv1.
-    """
-    if settings.dropout:
-        uniform = np.stack([generator.random((1, K.shape[-1])) for generator in generators])
-        kept = (uniform >= settings.dropout) / (1 - settings.dropout)
-        K = K * torch.from_numpy(kept).to(K)
-    costs = _costs(K, problem)
-    total = costs.mean(1)
-    if settings.variance_penalty:
-        total = total + settings.variance_penalty * costs.var(1, unbiased=False)
-    if settings.scale_penalty:
-        more, less = (_costs((1 + change) * K, problem) for change in (SCALED_BY, -SCALED_BY))
-        slopes = (more - less) / (2 * SCALED_BY)
-        total = total + settings.scale_penalty * slopes.square().mean(1)
-    return torch.where(total.isfinite(), total, torch.inf)
 
 
 @checked
@@ -335,11 +285,6 @@ def train(
         if iteration < settings.num_iterations:
             for learner in learners:
                 learner.iterate()
-
-
-def _costs(K: Tensor, problem: LQR) -> Tensor:
-    """Of each training domain, ``[R, E]``."""
-    return feedback_costs(split_domains(K @ problem.seen, problem.num_domains), problem)
 
 
 def _costs_of_domains(problem: LQR, seen: Tensor) -> list[DomainCost]:

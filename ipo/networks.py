@@ -242,42 +242,6 @@ def vjp(
     return (outputs[0].detach(), outputs[1].detach()), pull_back
 
 
-def dropout_factors(
-    network: Network, weights: Weights, probability: float, generators: Generators
-) -> Weights:
-    """Of dropout above Phi: ``{name: [R, inputs, 1]}`` for the matrix of each layer.
-
-    An input is left out, 0, with the probability, or scaled by 1 / (1 - probability). What is left
-    out is left out for all frames of a minibatch, and drawn run by run.
-    """
-    factors = {}
-    for layer, (num_inputs, _) in network.shapes.items():
-        if layer not in network.phi:
-            uniform = np.stack([generator.random(num_inputs) for generator in generators])
-            kept = torch.from_numpy((uniform >= probability) / (1 - probability))
-            name = f"{layer}.weight"
-            factors[name] = kept.to(weights[name]).unsqueeze(-1)
-    return factors
-
-
-def vjp_with_dropout(
-    network: Network, weights: Weights, observations: Tensor, factors: Weights
-) -> tuple[Outputs, PullBack]:
-    """:meth:`Network.vjp` where some matrices are multiplied by factors."""
-
-    def multiplied(name: str, x: Tensor) -> Tensor:
-        return x * factors[name] if name in factors else x
-
-    thinned = {name: multiplied(name, w) for name, w in weights.items()}
-    outputs, pull_back = network.vjp(thinned, observations)
-
-    def pull_back_to_all(of_parameters: Tensor, of_values: Tensor) -> list[Tensor]:
-        slopes = pull_back(of_parameters, of_values)
-        return [multiplied(name, x) for name, x in zip(weights, slopes, strict=True)]
-
-    return outputs, pull_back_to_all
-
-
 @checked
 def copied(players: Sequence[Weights]) -> list[Weights]:
     """The players as they are now, without gradients; training changes weights in place."""

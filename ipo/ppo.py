@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial, reduce
+from functools import reduce
 from typing import Annotated, Any
 
 import numpy as np
@@ -25,23 +25,12 @@ from ipo.checks import (
     Probability,
     Seeds,
     check_count,
-    check_number,
     checked,
     one_of,
 )
-from ipo.distributions import Categorical, Distribution, Generators
+from ipo.distributions import Distribution, Generators
 from ipo.game import Move, moves, play_round
-from ipo.networks import (
-    Network,
-    Outputs,
-    PullBack,
-    Weights,
-    chosen_rows,
-    dropout_factors,
-    in_one_row,
-    vjp_with_dropout,
-)
-from ipo.penalties import scale_factors, variance_factors
+from ipo.networks import Network, Outputs, PullBack, Weights, chosen_rows, in_one_row
 from ipo.rollouts import Collector, Device, Environments, Rollout, TimeOuts
 
 METHODS = ("ppo", "ipo", "ensemble", "in_turn")
@@ -86,10 +75,6 @@ class PPOSettings:
             learns nothing from it (the published doors).
         skip_last_frames: whether every second epoch leaves out the last frame of each copy; the
             published keys do, by a side effect of code for recurrent networks.
-        weight_decay: decoupled (AdamW), per unit of learning rate, of all weights.
-        dropout: probability with which an input of a layer above the network's Phi is left out of
-            a gradient step; those that stay are scaled up. Rollouts are collected with all.
-        variance_penalty, scale_penalty: weights of :mod:`ipo.penalties`, after V-REx and IRMv1.
     """
 
     method: Annotated[str, one_of(METHODS)]
@@ -114,10 +99,6 @@ class PPOSettings:
     normalize_advantages: Annotated[str, one_of(NORMALIZATIONS)] = "none"
     time_outs: TimeOuts = "bootstrap"
     skip_last_frames: bool = False
-    weight_decay: NonNegative = 0.0
-    dropout: Annotated[float, partial(check_number, least=0, below=1)] = 0.0
-    variance_penalty: NonNegative = 0.0
-    scale_penalty: NonNegative = 0.0
 
     def moves(self, num_domains: int) -> list[Move]:
         """Of a round; ``ppo`` is what the game calls ``pooled``."""
@@ -192,7 +173,7 @@ class Training:
     Raises:
         ValueError: ``num_envs`` that cannot be split evenly among players and domains, a
             minibatch larger than a player's rollout, seeds that are no different whole numbers,
-            a device that is not there, a network without what the settings need.
+            a device that is not there, a variable Phi of a network that has none.
     """
 
     @checked
@@ -212,21 +193,16 @@ class Training:
             owned.append(list(range(num_domains)))
         for own in copies:
             settings.size_of_minibatches(settings.num_steps * sum(own))
-        _check_needs(network, owned, settings)
-        streams = [np.random.SeedSequence(seed).spawn(4) for seed in seeds]
-        self.draws, self.resets, self.orders, self.dropouts = (
-            [np.random.default_rng(stream[i]) for stream in streams] for i in range(4)
+        if settings.variable_phi and not network.phi:
+            raise ValueError("variable_phi = True: needs a network that has a phi")
+        streams = [np.random.SeedSequence(seed).spawn(3) for seed in seeds]
+        self.draws, self.resets, self.orders = (
+            [np.random.default_rng(stream[i]) for stream in streams] for i in range(3)
         )
         self.network, self.settings, self.num_frames = network, settings, 0
         self._start(device)
         self.optimizers = [
-            torch.optim.AdamW(
-                [own],
-                settings.learning_rate,
-                eps=settings.adam_epsilon,
-                weight_decay=settings.weight_decay,
-                fused=True,
-            )
+            torch.optim.Adam([own], settings.learning_rate, eps=settings.adam_epsilon, fused=True)
             for own in self.rows
         ]
         environments = [
@@ -234,7 +210,6 @@ class Training:
             for domains, own in zip(owned, copies, strict=True)
         ]
         self.collectors = [settings.collector(own, device) for own in environments]
-        self.sizes = [[settings.num_steps * number for number in own] for own in copies]
 
     def _start(self, device: Device) -> None:
         """Draw all players, as ever; what they share is that of the first."""
@@ -289,37 +264,34 @@ class Training:
         average, distribution = self.network.frozen(self.players), self.network.distribution
         rollout = self.collectors[move].collect(average, distribution, self.draws)
         self.num_frames += rollout.values[0].numel()
-        frames, sizes, factors = rollout.frames(), self.sizes[move], None
-        if penalty := self.settings.variance_penalty:
-            by_domain = variance_factors(frames.returns, sizes, penalty)
-            frames = frames._replace(advantages=by_domain * frames.advantages)
-        if penalty := self.settings.scale_penalty:
-            entropies = distribution.entropy(average(frames.observations)[0])
-            slopes = frames.log_probabilities + entropies
-            factors = scale_factors(slopes, frames.advantages, sizes, penalty)
-        self.improve(part, frames, factors)
+        self.improve(part, self._frames(move, rollout))
 
-    def improve(self, d: int, frames: Rollout, factors: Tensor | None = None) -> None:
+    def _frames(self, move: int, rollout: Rollout) -> Rollout:
+        """What is learned from, ``[R, F]``."""
+        return rollout.frames()
+
+    def improve(self, d: int, frames: Rollout) -> None:
         """Some epochs of PPO for part d on frames ``[R, F]``, while all others stand still.
 
         A player sees its own outputs only through the average, so they carry the factor 1 / E.
-        ``factors [R, F]`` are those of a penalty on the scale of scores.
         """
         settings, share = self.settings, 1 / len(self.players)
-        distribution, others = self.network.distribution, self._others(d, frames.observations)
-        columns = others if factors is None else [*others, factors]
+        others = self._others(d, frames.observations)
         if settings.normalize_advantages == "rollout":
             frames = frames._replace(advantages=standardize(frames.advantages))
         for epoch in range(settings.num_epochs):
             skip = settings.skip_last_frames and epoch % 2 == 1
-            for batch, more in minibatches(frames, columns, settings, self.orders, skip):
+            for batch, rest in minibatches(frames, others, settings, self.orders, skip):
                 (parameters, values), pull_back = self._vjp(d, batch.observations)
                 parameters, values = share * parameters, share * values
-                if others:
-                    parameters, values = more[0] + parameters, more[1] + values
-                outputs, rest = (parameters, values), more[len(others) :]
-                slopes = loss_gradient(distribution, *outputs, batch, settings, *rest)
+                if rest:
+                    parameters, values = rest[0] + parameters, rest[1] + values
+                slopes = self._slopes(parameters, values, batch)
                 self._descend(d, pull_back(*(share * slope for slope in slopes)))
+
+    def _slopes(self, parameters: Tensor, values: Tensor, batch: Rollout) -> tuple[Tensor, Tensor]:
+        """Of the loss in the average's outputs."""
+        return loss_gradient(self.network.distribution, parameters, values, batch, self.settings)
 
     def _vjp(self, d: int, observations: Tensor) -> tuple[Outputs, PullBack]:
         """Sums of the outputs that part d has a part in; from their slopes to those in its weights.
@@ -342,11 +314,7 @@ class Training:
         return (parameters, values), pull_back
 
     def _vjp_of_player(self, player: Weights, observations: Tensor) -> tuple[Outputs, PullBack]:
-        network, probability = self.network, self.settings.dropout
-        if not probability:
-            return network.vjp(player, observations)
-        factors = dropout_factors(network, player, probability, self.dropouts)
-        return vjp_with_dropout(network, player, observations, factors)
+        return self.network.vjp(player, observations)
 
     def _others(self, d: int, observations: Tensor) -> list[Tensor]:
         """What the others contribute to the average; nothing where there are none."""
@@ -408,22 +376,7 @@ class Training:
             collector.restore(own)
 
     def _generators(self) -> list[np.random.Generator]:
-        return [*self.draws, *self.resets, *self.orders, *self.dropouts]
-
-
-def _check_needs(network: Network, owned: Sequence[Sequence[int]], settings: PPOSettings) -> None:
-    for name in ("variable_phi", "dropout"):
-        if getattr(settings, name) and not network.phi:
-            raise ValueError(f"{name} = {getattr(settings, name)}: needs a network that has a phi")
-    if settings.variance_penalty and any(len(domains) < 2 for domains in owned):
-        raise ValueError(
-            f"variance_penalty = {settings.variance_penalty}: needs players of several domains"
-        )
-    if settings.scale_penalty and network.distribution is not Categorical:
-        raise ValueError(
-            f"scale_penalty = {settings.scale_penalty}: needs actions to choose from, whose scores "
-            "can be scaled"
-        )
+        return [*self.draws, *self.resets, *self.orders]
 
 
 def minibatches(
@@ -444,7 +397,7 @@ def minibatches(
     # All in order at once, then in slices: cheaper than to choose for each minibatch.
     columns = [chosen_rows(x, order).split(size, dim=1) for x in (*frames, *others)]
     for batch in zip(*columns, strict=True):
-        yield Rollout(*batch[: len(frames)]), list(batch[len(frames) :])
+        yield type(frames)(*batch[: len(frames)]), list(batch[len(frames) :])
 
 
 def clipped_loss(
@@ -453,7 +406,6 @@ def clipped_loss(
     values: Tensor,
     batch: Rollout,
     settings: PPOSettings,
-    factors: Tensor | None = None,
 ) -> Tensor:
     """PPO's loss ``[R]``, to be minimised, on a minibatch ``[R, B]``::
 
@@ -461,20 +413,15 @@ def clipped_loss(
         + w_v mean max((V - G)^2, (clip(V, V_old - c, V_old + c) - G)^2),
         rho = pi(a | o) / pi_old(a | o)
 
-    G are the returns of the rollout. With ``factors f [R, B]`` of
-    :func:`ipo.penalties.scale_factors` there is one term more::
-
-        mean f clip(rho, 1 - c, 1 + c) A (log pi(a | o) + H(pi))
+    G are the returns of the rollout.
     """
-    gain, near_gain, error, near_error = _terms(distribution, parameters, values, batch, settings)
-    loss = (
+    gain, near_gain = gains(distribution, parameters, batch, settings)
+    error, near_error = _errors(values, batch, settings)
+    return (
         -torch.minimum(gain, near_gain).mean(1)
         - settings.entropy_weight * distribution.entropy(parameters).mean(1)
         + settings.value_weight * torch.maximum(error**2, near_error**2).mean(1)
     )
-    if factors is None:
-        return loss
-    return loss + (factors * near_gain * _slope(distribution, parameters, batch)).mean(1)
 
 
 def loss_gradient(
@@ -483,54 +430,41 @@ def loss_gradient(
     values: Tensor,
     batch: Rollout,
     settings: PPOSettings,
-    factors: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Of :func:`clipped_loss` in each frame's parameters ``[R, B, P]`` and value ``[R, B]``::
 
         - (1/B) [rho A grad log pi(a | o) + w_e grad H(pi)],        (2 w_v / B) (V - G)
 
     without rho A and V - G where the minimum and the maximum are those of the clipped numbers,
-    which are constant. By hand, for torch would take four times as long. The term with factors
-    needs no more than these gradients, since that of log pi + H is their sum.
+    which are constant. By hand, for torch would take four times as long.
     """
-    gain, near_gain, error, near_error = _terms(distribution, parameters, values, batch, settings)
+    gain, near_gain = gains(distribution, parameters, batch, settings)
+    error, near_error = _errors(values, batch, settings)
     share = 1 / values.shape[1]
     weights = -share * gain.masked_fill(near_gain < gain, 0.0)
-    entropy_weight: float | Tensor = -share * settings.entropy_weight
-    if factors is not None:
-        slope = _slope(distribution, parameters, batch)
-        inside = gain.masked_fill(gain != near_gain, 0.0)
-        weights = weights + share * factors * (inside * slope + near_gain)
-        entropy_weight = (entropy_weight + share * factors * near_gain).unsqueeze(-1)
-    of_parameters = distribution.gradient(parameters, batch.actions, weights, entropy_weight)
+    of_parameters = distribution.gradient(
+        parameters, batch.actions, weights, -share * settings.entropy_weight
+    )
     of_values = error.masked_fill(near_error**2 > error**2, 0.0)
     return of_parameters, 2 * share * settings.value_weight * of_values
 
 
-def _slope(distribution: type[Distribution], parameters: Tensor, batch: Rollout) -> Tensor:
-    """Of log pi(a | o) in a factor on all scores, ``[R, B]``: log pi(a | o) + H(pi)."""
-    return distribution.log_probability(parameters, batch.actions) + distribution.entropy(
-        parameters
-    )
-
-
-def _terms(
-    distribution: type[Distribution],
-    parameters: Tensor,
-    values: Tensor,
-    batch: Rollout,
-    settings: PPOSettings,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """rho A, clip(rho) A, V - G and clip(V) - G, ``[R, B]`` each."""
-    gains = batch.advantages
+def gains(
+    distribution: type[Distribution], parameters: Tensor, batch: Rollout, settings: PPOSettings
+) -> tuple[Tensor, Tensor]:
+    """``rho A`` and ``clip(rho) A``, ``[R, B]`` each."""
+    advantages = batch.advantages
     if settings.normalize_advantages == "minibatch":
-        gains = standardize(gains)
+        advantages = standardize(advantages)
     ratio = distribution.log_probability(parameters, batch.actions) - batch.log_probabilities
     ratio = ratio.exp()
-    near = ratio.clamp(1 - settings.clip, 1 + settings.clip)
-    lowest, highest = batch.values - settings.clip, batch.values + settings.clip
-    near_values = values.clamp(lowest, highest)
-    return ratio * gains, near * gains, values - batch.returns, near_values - batch.returns
+    return ratio * advantages, ratio.clamp(1 - settings.clip, 1 + settings.clip) * advantages
+
+
+def _errors(values: Tensor, batch: Rollout, settings: PPOSettings) -> tuple[Tensor, Tensor]:
+    """``V - G`` and ``clip(V) - G``, ``[R, B]`` each."""
+    near = values.clamp(batch.values - settings.clip, batch.values + settings.clip)
+    return values - batch.returns, near - batch.returns
 
 
 def standardize(gains: Tensor) -> Tensor:

@@ -28,8 +28,11 @@ from ipo.optimizers import descend, make_optimizer
 class Task(Protocol):
     """Domains in which a linear predictor is judged."""
 
-    shape: tuple[int, int, int]  # runs R, domains E, features d
-    dtype: torch.dtype
+    @property
+    def shape(self) -> tuple[int, int, int]: ...  # runs R, domains E, features d
+
+    @property
+    def dtype(self) -> torch.dtype: ...
 
     def risks(self, v: Tensor) -> Tensor: ...
 
@@ -95,16 +98,7 @@ class Regression:
     @property
     def costs(self) -> list[Cost]:
         """The risk ``[R]`` of every domain as a function of its own."""
-
-        def cost_in(gram: Tensor, moment: Tensor, power: Tensor) -> Cost:
-            def cost(v: Tensor) -> Tensor:
-                quadratic = torch.einsum("rp,rpq,rq->r", v, gram, v)
-                return power - 2 * (v * moment).sum(-1) + quadratic
-
-            return cost
-
-        domains = zip(self.gram.unbind(1), self.moment.unbind(1), self.power.unbind(1), strict=True)
-        return [cost_in(*domain) for domain in domains]
+        return [_cost_in(self.domain(e)) for e in range(self.shape[1])]
 
     @property
     def optima(self) -> Tensor:
@@ -207,7 +201,7 @@ def erm(task: Task, settings: PredictorSettings) -> Tensor:
     min_v  (1 / E) sum_e R_e(v)
     """
     v = _zeros(task)
-    return _minimize(lambda: _objective(task, settings, v).mean(1), v, settings)
+    return _minimize(lambda: _objective(task, settings.ridge, v).mean(1), v, settings)
 
 
 @checked
@@ -228,7 +222,7 @@ def irmv1(task: Task, settings: PredictorSettings) -> Tensor:
 
 def irm_objective(task: Task, settings: PredictorSettings, Phi: Tensor) -> Tensor:
     """What :func:`irmv1` minimises, ``[R]``, for ``Phi [R, d, k]``."""
-    risks = _objective(task, settings, Phi.sum(-1))
+    risks = _objective(task, settings.ridge, Phi.sum(-1))
     return (risks + settings.penalty * irm_penalties(task, Phi)).mean(1)
 
 
@@ -248,7 +242,7 @@ def vrex(task: Task, settings: PredictorSettings) -> Tensor:
     v = _zeros(task)
 
     def objective() -> Tensor:
-        risks = _objective(task, settings, v)
+        risks = _objective(task, settings.ridge, v)
         return risks.mean(1) + settings.penalty * risks.var(1, correction=0)
 
     return _minimize(objective, v, settings)
@@ -290,7 +284,8 @@ def irm_game_variable_phi(task: Task, settings: PredictorSettings) -> Tensor:
 
     def move_phi() -> None:
         descend(
-            optimizer, lambda: _objective(task, settings, predictor(players.policy, Phi)).mean(1)
+            optimizer,
+            lambda: _objective(task, settings.ridge, predictor(players.policy, Phi)).mean(1),
         )
 
     def above_phi(cost: Cost) -> Cost:
@@ -314,16 +309,18 @@ def _players(task: Task, settings: PredictorSettings, dim: int) -> LinearPlayers
 
 
 def _domain_costs(task: Task, settings: PredictorSettings) -> list[Cost]:
-    """What each domain's player wants low: ``cost(v) [R]``."""
-
-    def cost_in(domain: Task) -> Cost:
-        return lambda v: _objective(domain, settings, v).squeeze(1)
-
-    return [cost_in(task.domain(e)) for e in range(task.shape[1])]
+    """What each domain's player wants low."""
+    return [_cost_in(task.domain(e), settings.ridge) for e in range(task.shape[1])]
 
 
-def _objective(task: Task, settings: PredictorSettings, v: Tensor) -> Tensor:
-    return task.risks(v) + settings.ridge * v.square().sum(-1, keepdim=True)
+def _cost_in(domain: Task, ridge: float = 0.0) -> Cost:
+    """``cost(v) [R]`` of one domain."""
+    return lambda v: _objective(domain, ridge, v).squeeze(1)
+
+
+def _objective(task: Task, ridge: float, v: Tensor) -> Tensor:
+    risks = task.risks(v)
+    return risks + ridge * v.square().sum(-1, keepdim=True) if ridge else risks
 
 
 def _zeros(task: Task) -> Tensor:

@@ -19,6 +19,7 @@ from minigrid.core.constants import OBJECT_TO_IDX
 from experiments.experiment import Experiment
 from experiments.files import check_file_name
 from experiments.policies import check_place, load_policy, save_policy
+from experiments.regularized.networks import training_of
 from experiments.rows import tidy
 from experiments.tables import mean_and_std
 from experiments.tabulated import load_or_tabulate
@@ -26,7 +27,7 @@ from experiments.visits import occupancy, reach
 from ipo.checks import Count, Positive, check_choice, check_choices, checked, one_of
 from ipo.distributions import Categorical
 from ipo.networks import Weights
-from ipo.ppo import MakeEnvironments, PPOSettings, Training
+from ipo.ppo import MakeEnvironments, PPOSettings
 from ipo.stats import paired_difference, probability_of_improvement
 from ipo.worlds.colored_keys import COLORS, ColoredKeysEnv
 from ipo.worlds.networks import GridNetwork, OnTable
@@ -44,7 +45,6 @@ ENCODINGS = ("integer", "one_hot", "none")
 COLOR_CHANNEL = 1
 NUM_COPIES, NUM_EPISODES = 50, 100  # of the published evaluation
 NUM_SAVED = 10  # runs of a cell whose weights are kept
-WITNESSED = {"weight_decay": 0.1, "dropout": 0.1, "variance_penalty": 10, "scale_penalty": 10}
 
 
 def published(method: str, **changes: Any) -> PPOSettings:
@@ -331,7 +331,7 @@ class Keys:
     ) -> Iterator[tuple[int, list[Weights]]]:
         """The same in domains that are not colours; they index ``images [K, 7, 7, 3]``."""
         network = OnTable(self.network, encode(images, self.color_encoding))
-        return Training(network, domains, num_domains, cell.settings, seeds).reports()
+        return training_of(network, domains, num_domains, cell.settings, seeds).reports()
 
     def logits(self, players: Sequence[Weights], images: np.ndarray) -> torch.Tensor:
         """Of the average policy ``[R, K, A]`` for MiniGrid's ``images [K, 7, 7, 3]``.
@@ -471,7 +471,7 @@ def description(task: TabularTask) -> dict[str, float]:
 def short(cell: Cell) -> Cell | None:
     """Two updates. Larger grids take minutes to tabulate; other colours are of no other kind.
 
-    Nor are inner rounds without a variable Phi, and other weights of a regulariser than one.
+    Nor are inner rounds without a variable Phi.
 
     Normalised advantages are large while returns are nearly zero: there one update is enough for
     rounding to become visible, and two make another policy of it.
@@ -482,8 +482,6 @@ def short(cell: Cell) -> Cell | None:
         return None
     if cell.settings.num_inner_rounds > 1 and not cell.settings.variable_phi:
         return None
-    if any(getattr(cell.settings, name) not in (0, one) for name, one in WITNESSED.items()):
-        return None
     num_updates = 2 if cell.settings.normalize_advantages == "none" else 1
     return replace(cell, settings=replace(cell.settings, num_updates=num_updates))
 
@@ -493,10 +491,7 @@ EXPERIMENTS = (
         name: Experiment(run_cell, Cell, short, runs_at_once=25)
         for name in ("main", "turns", "variants", "larger")
     }
-    | {
-        name: Experiment(run_rows, Cell, short, runs_at_once=25)
-        for name in ("in_full", "regularized", "fair")
-    }
+    | {name: Experiment(run_rows, Cell, short, runs_at_once=25) for name in ("in_full", "fair")}
     | {
         "curves": Experiment(run_curve, Cell, short, runs_at_once=25),
         "grids": Experiment(run_grid, Grid, lambda grid: grid if grid.size == 5 else None, (0,)),

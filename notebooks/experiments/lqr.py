@@ -193,7 +193,7 @@ def run_cell(cell: Cell, seeds: list[int]) -> pd.DataFrame:
 
     The oracle, which sees the state, costs the same in every domain.
     """
-    problem = _problem(cell, seeds)
+    problem = problem_of(cell, seeds)
     if cell.label == "oracle":
         _, cost = riccati_gain(problem)
         return tidy(cell, seeds, {("test", "test_cost"): cost})
@@ -202,7 +202,7 @@ def run_cell(cell: Cell, seeds: list[int]) -> pd.DataFrame:
 
 def run_curve(cell: Cell, seeds: list[int], num_points: int = 40) -> pd.DataFrame:
     """The same, evaluated on the way: rows with a column ``iteration``, even in its logarithm."""
-    problem = _problem(cell, seeds)
+    problem = problem_of(cell, seeds)
     last = cell.settings.num_iterations
     checkpoints = {round(last ** (i / num_points)) for i in range(num_points + 1)} | {0}
     parts = []
@@ -218,7 +218,7 @@ def run_closed_loops(
 
     The starts are the same in all runs. The oracle is the invariant controller.
     """
-    problem = _problem(cell, seeds)
+    problem = problem_of(cell, seeds)
     gain = final_gain(cell, problem, seeds)
     starts = torch.randn(
         num_starts, problem.A.shape[-1], generator=torch.Generator().manual_seed(0)
@@ -243,7 +243,7 @@ def run_outside(cell: Cell, seeds: list[int]) -> pd.DataFrame:
 
     ``test_cost_random_outside`` is the cost with a random part of the same norm in its place.
     """
-    problem = _problem(cell, seeds)
+    problem = problem_of(cell, seeds)
     gain = final_gain(cell, problem, seeds)
     basis = row_space(problem)
     outside = gain - project(gain, basis)
@@ -316,7 +316,8 @@ def _early_stopped_gain(problem: LQR, settings: LQRSettings, seeds: list[int]) -
     return best
 
 
-def _problem(cell: Cell, seeds: list[int]) -> LQR:
+def problem_of(cell: Cell, seeds: list[int]) -> LQR:
+    """The problems of runs, in a cell's precision."""
     dtype = getattr(torch, cell.precision)
     return sample_problem(seeds, cell.num_domains, cell.dim_distractor, dtype=dtype)
 
@@ -353,7 +354,6 @@ EXPERIMENTS = {
     "curves": Experiment(run_curve, Cell, short),
     "closed_loops": Experiment(run_closed_loops, Cell, short),
     "outside": Experiment(run_outside, Cell, short),
-    "regularized": Experiment(run_cell, Cell, short),
 }
 
 

@@ -11,12 +11,13 @@ from experiments.doors import success as door
 from experiments.experiment import Experiment, Places
 from experiments.games import scalar as algorithm
 from experiments.origin import ROOT
+from experiments.regularized import linear, trials
 from ipo.checks import check_choice
 
 DATA = ROOT / "data"
 CHAPTERS: dict[str, dict[str, Experiment]] = {
-    "lqr": lqr.EXPERIMENTS,
-    "keys": keys.EXPERIMENTS | keys_labels.EXPERIMENTS,
+    "lqr": lqr.EXPERIMENTS | linear.EXPERIMENTS,
+    "keys": keys.EXPERIMENTS | trials.EXPERIMENTS | keys_labels.EXPERIMENTS,
     "cue": cue.EXPERIMENTS,
     "causality": causality.EXPERIMENTS,
     "algorithm": algorithm.EXPERIMENTS,

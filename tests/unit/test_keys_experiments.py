@@ -12,10 +12,9 @@ import torch
 from minigrid.core.constants import OBJECT_TO_IDX
 
 from experiments import keys as experiment
-from experiments import keys_in_full, keys_labels, regularizers
+from experiments import keys_in_full, keys_labels
 from experiments.experiment import filled, plain, rebuilt
 from experiments.keys import (
-    EXPERIMENTS,
     Cell,
     Keys,
     encode,
@@ -30,6 +29,8 @@ from experiments.keys import (
     runs_of,
 )
 from experiments.policies import load_policy
+from experiments.registry import CHAPTERS
+from experiments.regularized import trials
 from experiments.store import Batch, Store
 from experiments.tables import beside_shipped
 from experiments.visits import occupancy
@@ -315,7 +316,7 @@ SHIPPED = {
         ("ipo_inner2", TWO, "integer", 5): 25,
         ("ipo_phi_short", TWO, "integer", 5): 50,
     },
-    "regularized": {(label, TWO, "integer", 5): 25 for label in regularizers.KEYS.settings},
+    "regularized": {(label, TWO, "integer", 5): 25 for label in trials.KEYS.settings},
     "curves": {(method, TWO, "integer", 5): 30 for method in ("ppo", "ipo", "ensemble")},
     "fair": {
         (method, TWO, "integer", 5): 50
@@ -345,8 +346,7 @@ def shipped() -> dict[str, pd.DataFrame]:
 
 def test_every_shipped_file_is_tested_here():
     assert {path.stem for path in RESULTS.glob("*.csv")} == SHIPPED.keys() | {"grids"}
-    both = EXPERIMENTS | keys_labels.EXPERIMENTS
-    assert both.keys() == SHIPPED.keys() | {"grids"}
+    assert CHAPTERS["keys"].keys() == SHIPPED.keys() | {"grids"}
 
 
 @pytest.mark.parametrize("name", SHIPPED)
@@ -544,7 +544,7 @@ def test_arms_of_other_colours_differ_in_the_colours_alone():
         (experiment.variant_arms, [20]),
         (experiment.larger_arms, [20, 6]),
         (keys_in_full.full_arms, [20]),
-        (regularizers.keys_arms, [20]),
+        (trials.keys_arms, [20]),
     ):
         for usual, other in zip(make(*options), make(*options, colors), strict=True):
             fixed = usual.label.endswith("_inside")

@@ -181,7 +181,7 @@ def flat(training: Training) -> Tensor:
 
 @pytest.mark.parametrize(
     ("method", "more"),
-    [*((method, {}) for method in METHODS), ("ipo", {"variable_phi": True, "dropout": 0.2})],
+    [*((method, {}) for method in METHODS), ("ipo", {"variable_phi": True})],
 )
 def test_a_restored_training_goes_on_as_if_nothing_had_happened(method, more):
     changes = {"normalize_rewards": True, "normalize_advantages": "rollout", "num_steps": 18}

@@ -12,10 +12,11 @@ import torch
 
 from experiments.cue.theory import PENALTIES, Cues, text
 from experiments.experiment import Experiment
+from experiments.regularized.networks import RegularizedSettings, training_of
 from experiments.rows import tidy
 from ipo.checks import checked, one_of
 from ipo.networks import Weights
-from ipo.ppo import PPOSettings, Training
+from ipo.ppo import Training
 from ipo.worlds.cued_maze import Cue, cued_maze
 from ipo.worlds.networks import DenseOnTable
 from ipo.worlds.tabular import TabularDomains, expected_return
@@ -37,7 +38,7 @@ class Cell:
             (``signs``), or which of the eight observations it is (``one_hot``).
     """
 
-    settings: PPOSettings
+    settings: RegularizedSettings
     cues: Annotated[tuple[Cue, ...], "domains"]
     encoding: Annotated[str, one_of(ENCODINGS)] = "signs"
 
@@ -58,9 +59,9 @@ class Varied(Cell):
         return super().columns | more
 
 
-def one_step(method: str, num_updates: int) -> PPOSettings:
+def one_step(method: str, num_updates: int) -> RegularizedSettings:
     """A player makes one gradient step on each rollout, as the theory has it."""
-    return PPOSettings(
+    return RegularizedSettings(
         method,
         learning_rate=2e-2,
         num_updates=num_updates,
@@ -72,9 +73,9 @@ def one_step(method: str, num_updates: int) -> PPOSettings:
     )
 
 
-def many_steps(method: str, num_updates: int) -> PPOSettings:
+def many_steps(method: str, num_updates: int) -> RegularizedSettings:
     """A player learns from each rollout in four epochs of four minibatches, as PPO usually does."""
-    return PPOSettings(
+    return RegularizedSettings(
         method,
         learning_rate=1e-2,
         num_updates=num_updates,
@@ -131,7 +132,7 @@ def varied_cells(cues: Cues, num_updates: int) -> list[Varied]:
 def training(cell: Cell, seeds: list[int]) -> Training:
     """Runs of a cell that have not begun."""
     domains = TabularDomains([cued_maze(cue) for cue in cell.cues])
-    return Training(network(cell.encoding), domains, len(cell.cues), cell.settings, seeds)
+    return training_of(network(cell.encoding), domains, len(cell.cues), cell.settings, seeds)
 
 
 def network(encoding: str) -> DenseOnTable:

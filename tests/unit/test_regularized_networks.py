@@ -6,10 +6,19 @@ import torch
 from small import DoubleNetwork, assert_close
 from torch import Tensor
 
+from experiments.regularized.networks import (
+    Penalized,
+    RegularizedSettings,
+    dropout_factors,
+    scale_factors,
+    scale_gradient,
+    scale_penalty,
+    training_of,
+    variance_factors,
+    vjp_with_dropout,
+)
 from ipo.distributions import Categorical
-from ipo.networks import DenseNetwork, dropout_factors, vjp_with_dropout
-from ipo.penalties import scale_factors, variance_factors
-from ipo.ppo import PPOSettings, Training
+from ipo.networks import DenseNetwork
 
 SIZES = [3, 5, 2]
 
@@ -57,6 +66,18 @@ def test_factors_are_the_gradient_of_the_squared_slopes():
     assert_close(Categorical.gradient(plain, actions, weights, entropy_weight), expected)
 
 
+def test_gradient_of_the_penalty_is_that_of_torch():
+    """On frames of which many are clipped."""
+    logits, values, gains = normal(2, 400, 3), normal(2, 400, seed=1), normal(2, 400, seed=2)
+    actions = normal(2, 400, 3, seed=3).argmax(-1)
+    old = Categorical.log_probability(logits, actions) + 0.3 * normal(2, 400, seed=4)
+    batch = Penalized(values, actions, old, values, gains, values, normal(2, 400, seed=5))
+    settings, leaf = RegularizedSettings("ppo"), logits.clone().requires_grad_()
+    penalty = scale_penalty(Categorical, leaf, batch, settings)
+    (expected,) = torch.autograd.grad(penalty.sum(), leaf)
+    assert_close(scale_gradient(Categorical, logits, batch, settings), expected)
+
+
 def test_nothing_is_to_be_scaled_where_actions_are_as_good_as_each_other():
     zero = torch.zeros(2, 10, dtype=torch.float64)
     assert not scale_factors(normal(2, 10), zero, SIZES, 1.0).any()
@@ -102,7 +123,6 @@ def test_dropout_leaves_out_a_share_of_the_inputs_above_phi_and_keeps_the_mean()
     [
         ("ipo", {"variance_penalty": 1.0}, "variance_penalty = 1.0: needs players of several"),
         ("ppo", {"scale_penalty": 1.0}, "scale_penalty = 1.0: needs actions to choose from"),
-        ("ipo", {"variable_phi": True}, "variable_phi = True: needs a network that has a phi"),
         ("ppo", {"dropout": 0.5}, "dropout = 0.5: needs a network that has a phi"),
     ],
 )
@@ -112,4 +132,4 @@ def test_what_a_network_or_a_method_does_not_have_is_refused(method, changes, er
 
     network = DenseNetwork(3, 2, hidden=())  # of a Gaussian, without a first part
     with pytest.raises(ValueError, match=error):
-        Training(network, never, 2, PPOSettings(method, num_envs=4, **changes), [0])
+        training_of(network, never, 2, RegularizedSettings(method, num_envs=4, **changes), [0])

@@ -13,14 +13,17 @@ from __future__ import annotations
 import operator
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from experiments import keys, lqr
+from experiments import keys
+from experiments.experiment import Experiment
+from experiments.regularized.linear import RegularizedCell, RegularizedLQRSettings
+from experiments.regularized.networks import RegularizedSettings
 from experiments.tables import mean_and_std
+from ipo.lqr_learners import published_lqr
 from ipo.stats import paired_difference
 
 NAMES = {
@@ -137,19 +140,46 @@ LQR = Trial(
     allowed=np.log(1.01),
     digits=1,
 )
+WITNESSED = (
+    *("ppo_weight_decay0.1", "ppo_dropout0.1"),
+    *("ppo_variance_penalty10", "ppo_scale_penalty10"),
+)
 
 
-def keys_arms(num_updates: int, train_colors: Sequence[str] = keys.TRAINED) -> list[keys.Cell]:
+@dataclass(frozen=True)
+class KeysCell(keys.Cell):
+    """PPO with regularisers."""
+
+    settings: RegularizedSettings
+
+
+def keys_arms(num_updates: int, train_colors: Sequence[str] = keys.TRAINED) -> list[KeysCell]:
     """PPO as published, with each regulariser at each weight."""
-    of = partial(keys.arm, train_colors=tuple(train_colors), num_updates=num_updates)
-    return [of(label, KEYS.baseline, **changes) for label, changes in KEYS.settings.items()]
-
-
-def lqr_cells(num_domains: int, dim_distractor: int, num_iterations: int) -> list[lqr.Cell]:
-    """Gradient descent as published, with each regulariser at each weight."""
-    plain = lqr.published_cell(LQR.baseline, num_domains, dim_distractor, num_iterations)
+    plain = vars(keys.published(KEYS.baseline, num_updates=num_updates))
     return [
-        replace(plain, label=label, settings=replace(plain.settings, **changes))
+        KeysCell(label, RegularizedSettings(**plain, **changes), tuple(train_colors))
+        for label, changes in KEYS.settings.items()
+    ]
+
+
+def short(cell: KeysCell) -> KeysCell | None:
+    """As of other arms, of one weight of each regulariser: the others are of no other kind."""
+    return keys.short(cell) if cell.label in WITNESSED else None
+
+
+EXPERIMENTS = {"regularized": Experiment(keys.run_rows, KeysCell, short, runs_at_once=25)}
+
+
+def lqr_cells(num_domains: int, dim_distractor: int, num_iterations: int) -> list[RegularizedCell]:
+    """Gradient descent as published, with each regulariser at each weight."""
+    plain = vars(replace(published_lqr(LQR.baseline), num_iterations=num_iterations))
+    return [
+        RegularizedCell(
+            label,
+            num_domains,
+            dim_distractor,
+            RegularizedLQRSettings(**(plain | changes)),
+        )
         for label, changes in LQR.settings.items()
     ]
 

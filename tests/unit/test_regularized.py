@@ -8,10 +8,12 @@ import pytest
 import torch
 from small import assert_close, paper_problem, random_gain
 
-from experiments import keys, lqr, regularizers
-from experiments.regularizers import KEYS, largest_harmless
+from experiments import keys, lqr
+from experiments.regularized import linear, trials
+from experiments.regularized.networks import RegularizedSettings
+from experiments.regularized.trials import KEYS, largest_harmless
 from ipo.lqr import training_costs
-from ipo.lqr_learners import LQRSettings, published_lqr, regularized_cost, train
+from ipo.lqr_learners import published_lqr
 
 
 @pytest.mark.parametrize(
@@ -55,14 +57,15 @@ def test_the_table_says_what_is_chosen_and_how_far_it_is_from_others():
 
 def test_arms_differ_from_the_published_baseline_in_one_setting_alone():
     for cells, plain in (
-        (regularizers.keys_arms(20), keys.published("ppo")),
-        (regularizers.lqr_cells(5, 1000, 5000), published_lqr("gradient_descent")),
+        (trials.keys_arms(20), keys.published("ppo")),
+        (trials.lqr_cells(5, 1000, 5000), published_lqr("gradient_descent")),
     ):
         assert len({cell.label for cell in cells}) == len(cells)
         for cell in cells:
             own, usual = asdict(cell.settings), asdict(plain)
-            ((name, weight),) = {key: own[key] for key in own if own[key] != usual[key]}.items()
-            assert name in regularizers.NAMES and cell.label.endswith(f"_{name}{weight:g}")
+            changed = {key: own[key] for key in own if own[key] != usual.get(key, 0)}
+            ((name, weight),) = changed.items()
+            assert name in trials.NAMES and cell.label.endswith(f"_{name}{weight:g}")
 
 
 def test_values_of_the_new_domain_are_not_of_training():
@@ -70,7 +73,7 @@ def test_values_of_the_new_domain_are_not_of_training():
         {"method": "ppo", "run": 0, "domain": color, "metric": "return_exact", "value": value}
         for color, value in {"red": 0.5, "green": 0.75, "blue": 9.0, "grey": 0.25}.items()
     ]
-    values = regularizers.keys_values(pd.DataFrame(rows))
+    values = trials.keys_values(pd.DataFrame(rows))
     assert values.loc["ppo", 0].to_dict() == {"training": 0.625, "new": 0.25}
 
 
@@ -78,8 +81,9 @@ def test_values_of_the_new_domain_are_not_of_training():
 
 
 def regularized(K: torch.Tensor, problem, **changes: float) -> torch.Tensor:
-    settings = LQRSettings("gradient_descent", **changes)
-    return regularized_cost(K, problem, settings, [np.random.default_rng(run) for run in (0, 1)])
+    settings = linear.RegularizedLQRSettings("gradient_descent", **changes)
+    generators = [np.random.default_rng(run) for run in (0, 1)]
+    return linear.regularized_cost(K, problem, settings, generators)
 
 
 def test_penalty_on_the_variance_of_costs():
@@ -111,26 +115,55 @@ def test_dropout_leaves_out_whole_observations_of_each_run():
     assert not torch.equal(out[0], out[1])
 
 
-@pytest.mark.parametrize("name", regularizers.NAMES)
+@pytest.mark.parametrize("name", trials.NAMES)
 def test_runs_of_lqr_do_not_mix(name):
     changes = {name: 0.2, "num_iterations": 5}
-    problem, settings = paper_problem(), LQRSettings("gradient_descent", **changes)
-    *_, (_, together) = train(problem, settings, [3, 4])
-    *_, (_, alone) = train(problem.run(1), settings, [4])
-    assert_close(together[1:], alone)
-    *_, (_, plain) = train(problem, replace(settings, **{name: 0.0}), [3, 4])
+    settings = linear.RegularizedLQRSettings("gradient_descent", **changes)
+    problem, gain = paper_problem(), linear.regularized_gain
+    together = gain(problem, settings, [3, 4])
+    assert_close(together[1:], gain(problem.run(1), settings, [4]))
+    plain = gain(problem, replace(settings, **{name: 0.0}), [3, 4])
     assert not torch.allclose(together, plain)
 
 
 def test_other_methods_have_no_regularizers():
-    with pytest.raises(ValueError, match=r"dropout = 0\.1: is for gradient_descent alone"):
-        LQRSettings("ipo_fixed_phi", dropout=0.1)
+    with pytest.raises(ValueError, match="method = 'ipo_fixed_phi': must be 'gradient_descent'"):
+        linear.RegularizedLQRSettings("ipo_fixed_phi", dropout=0.1)
+
+
+def test_weight_decay_alone_is_gradient_descent_as_ever():
+    """Whose gradient is written out: it is half of the time, and the rows are those of before."""
+    cell = trials.lqr_cells(2, 20, 10)[0]
+    plain = lqr.published_cell("gradient_descent", 2, 20, 10)
+    decayed = replace(plain.settings, weight_decay=cell.settings.weight_decay)
+    theirs = lqr.run_cell(replace(plain, settings=decayed), [0, 1])
+    assert linear.run_cell(cell, [0, 1])["value"].tolist() == theirs["value"].tolist()
+
+
+@pytest.mark.parametrize("kind", [linear.RegularizedLQRSettings, RegularizedSettings])
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        *(("dropout", value) for value in (-0.1, 1.0, float("nan"))),
+        *(
+            (f"{of}_penalty", value)
+            for of in ("variance", "scale")
+            for value in (-1.0, float("inf"))
+        ),
+        ("weight_decay", -1.0),
+        ("learning_rate", 0.0),  # of what it inherits
+    ],
+)
+def test_bad_weights_are_refused(kind, name, value):
+    method = "ppo" if kind is RegularizedSettings else "gradient_descent"
+    with pytest.raises(ValueError, match=f"{name} = "):
+        kind(method, **{name: value})
 
 
 def test_a_run_that_leaves_the_stable_set_stays_out_and_its_cost_says_so():
-    cell = regularizers.lqr_cells(2, 20, 10)[-1]
-    rows = lqr.run_cell(cell, list(range(10)))
-    values = regularizers.lqr_values(rows)
+    cell = trials.lqr_cells(2, 20, 10)[-1]
+    rows = linear.run_cell(cell, list(range(10)))
+    values = trials.lqr_values(rows)
     lost = np.isinf(values["training"])
     assert 0 < lost.sum() < len(lost)
-    assert regularizers.LQR.spread(values["training"]) == f"infinite in {lost.sum()} of 10 runs"
+    assert trials.LQR.spread(values["training"]) == f"infinite in {lost.sum()} of 10 runs"
