@@ -2,7 +2,8 @@
 
 Phi is the network's convolutions, which the players share. It moves first in a round, on rollouts
 in all domains with as many frames as those of all players together. So a round has 1 + K times the
-frames of IPO as published; the arm called short has half the rounds, and as many frames in all.
+frames of IPO as published. The arm called short has half the rounds, and as many frames as IPO in
+all; a variable Phi with all rounds has as many as two inner rounds.
 """
 
 from __future__ import annotations
@@ -19,8 +20,10 @@ from experiments.tables import mean_and_std
 
 NAMES = {
     "ipo": "IPO, as published",
+    "ipo_phi_short": "variable Φ, half the rounds",
     "ipo_inner2": "K = 2",
-    "ipo_phi_short": "variable Φ",
+    "ipo_phi": "variable Φ",
+    "ipo_phi_inner2": "variable Φ, K = 2",
 }
 
 
@@ -28,8 +31,10 @@ def full_arms(num_updates: int, train_colors: Sequence[str] = TRAINED) -> list[C
     """All of them but IPO as published."""
     of = partial(arm, method="ipo", train_colors=tuple(train_colors))
     return [
-        of("ipo_inner2", num_updates=num_updates, num_inner_rounds=2),
         of("ipo_phi_short", num_updates=math.ceil(num_updates / 2), variable_phi=True),
+        of("ipo_inner2", num_updates=num_updates, num_inner_rounds=2),
+        of("ipo_phi", num_updates=num_updates, variable_phi=True),
+        of("ipo_phi_inner2", num_updates=num_updates, variable_phi=True, num_inner_rounds=2),
     ]
 
 
@@ -40,10 +45,10 @@ def num_frames(cell: Cell) -> int:
     return settings.num_updates * collected * settings.num_envs * settings.num_steps
 
 
-def to_ipo(rows: pd.DataFrame, label: str) -> str:
-    """The difference on grey to IPO as published, in the runs that an arm has."""
+def difference(rows: pd.DataFrame, label: str, other: str = "ipo") -> str:
+    """The difference on grey to another arm, IPO as published, in the runs that an arm has."""
     runs = rows.loc[rows["method"] == label, "run"]
-    return gap(rows[rows["run"].isin(runs)], label, "ipo")
+    return gap(rows[rows["run"].isin(runs)], label, other)
 
 
 def full_table(rows: pd.DataFrame, num_updates: int, train_colors: Sequence[str]) -> pd.DataFrame:
@@ -58,7 +63,7 @@ def full_table(rows: pd.DataFrame, num_updates: int, train_colors: Sequence[str]
             "frames": num_frames(cell),
             "training colours": mean_and_std(trained.mean(axis=1), 3),
             TESTED: mean_and_std(runs_of(rows, cell.label, TESTED), 3),
-            "difference on grey": "" if cell.label == "ipo" else to_ipo(rows, cell.label),
+            "difference on grey": "" if cell.label == "ipo" else difference(rows, cell.label),
         }
 
     ipo = next(cell for cell in main_arms(num_updates, train_colors) if cell.label == "ipo")
