@@ -75,38 +75,35 @@ def check_choice(name: str, value: object, choices: Iterable[str]) -> None:
 
 def check_choices(name: str, values: object, choices: Sequence[str]) -> None:
     """A list of some of ``choices``, each once."""
-    if isinstance(values, str) or not isinstance(values, Sequence) or not values:
-        raise ValueError(f"{name} = {values!r}: must be a list of some of {', '.join(choices)}")
-    for index, value in enumerate(values):
-        check_choice(f"{name}[{index}]", value, choices)
-    _check_different(name, values)
+    rule = partial(check_choice, choices=choices)
+    _check_list(name, values, f"some of {', '.join(choices)}", rule)
 
 
 def check_counts(name: str, values: object, minimum: int = 1, maximum: int | None = None) -> None:
     """A list of different whole numbers within the bounds, not empty."""
-    if isinstance(values, str | bytes) or not isinstance(values, Sequence):
-        raise TypeError(f"{name} = {values!r}: must be a list of whole numbers")
-    if not values:
-        raise ValueError(f"{name} = {values!r}: must not be empty")
-    for index, value in enumerate(values):
-        check_count(f"{name}[{index}]", value, minimum, maximum)
-    _check_different(name, values)
-
-
-def _check_different(name: str, values: Sequence[object]) -> None:
-    if len(set(values)) < len(values):
-        raise ValueError(f"{name} = {values!r}: must not name a value twice")
+    rule = partial(check_count, minimum=minimum, maximum=maximum)
+    _check_list(name, values, "whole numbers", rule)
 
 
 def check_numbers(name: str, values: object, length: int = 1, **bounds: float) -> None:
     """A list of at least so many different finite numbers within the bounds."""
+    _check_list(
+        name, values, "numbers", lambda name, value: check_number(name, value, **bounds), length
+    )
+
+
+def _check_list(
+    name: str, values: object, of: str, rule: Callable[[str, object], None], length: int = 1
+) -> None:
+    """A list of at least so many different values that fit the rule."""
     if isinstance(values, str | bytes) or not isinstance(values, Sequence):
-        raise TypeError(f"{name} = {values!r}: must be a list of numbers")
+        raise TypeError(f"{name} = {values!r}: must be a list of {of}")
     if len(values) < length:
-        raise ValueError(f"{name} = {values!r}: must have at least {length} numbers")
+        raise ValueError(f"{name} = {values!r}: must be at least {length} long")
     for index, value in enumerate(values):
-        check_number(f"{name}[{index}]", value, **bounds)
-    _check_different(name, values)
+        rule(f"{name}[{index}]", value)
+    if len(set(values)) < len(values):
+        raise ValueError(f"{name} = {values!r}: must not name a value twice")
 
 
 def check_checkpoints(checkpoints: Iterable[int], end: int) -> None:

@@ -40,7 +40,9 @@ def test_bad_parameter_is_refused_by_name(name, parameter, value):
     ],
 )
 def test_training_colours_that_cannot_be(colors, rule):
-    with pytest.raises(ValueError, match=rf"^train_colors.* = .*must .*{re.escape(rule)}"):
+    with pytest.raises(
+        (TypeError, ValueError), match=rf"^train_colors.* = .*must .*{re.escape(rule)}"
+    ):
         begin("keys", train_colors=colors)
 
 

@@ -113,7 +113,7 @@ def test_parameters_that_a_notebook_has(injected):
 @pytest.mark.parametrize(
     ("seeds", "message"),
     [
-        ([], r"^seeds = \[\]: must not be empty"),
+        ([], r"^seeds = \[\]: must be at least 1 long"),
         ([2, 2], r"^seeds = \[2, 2\]: must not name a value twice"),
         ([-1], r"^seeds\[0\] = -1: must be at least 0"),
     ],

@@ -139,7 +139,7 @@ def test_vector_environment_that_does_not_fit(mode, num_envs, num_runs, message)
         (Cell("ppo", published("ppo", num_envs=5)), [0], r"^num_envs = 5: must be a multiple of 2"),
         (Cell("ipo", published("ipo", minibatch_size=5000)), [0], r"^minibatch_size = 5000: must"),
         (Cell("ppo", published("ppo")), [0, 0], r"^seeds = \[0, 0\]: must not name a value twice"),
-        (Cell("ppo", published("ppo")), [], r"^seeds = \[\]: must not be empty"),
+        (Cell("ppo", published("ppo")), [], r"^seeds = \[\]: must be at least 1 long"),
     ],
 )
 def test_cell_that_cannot_be_run_saves_no_policy(tmp_path, tables, keys, cell, seeds, message):
