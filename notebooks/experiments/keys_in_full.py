@@ -24,17 +24,22 @@ NAMES = {
     "ipo_inner2": "K = 2",
     "ipo_phi": "variable Φ",
     "ipo_phi_inner2": "variable Φ, K = 2",
+    "ensemble_inner2": "ensemble, K = 2",
+    "ensemble_phi": "ensemble, variable Φ",
 }
 
 
 def full_arms(num_updates: int, train_colors: Sequence[str] = TRAINED) -> list[Cell]:
-    """All of them but IPO as published."""
+    """All of them but IPO as published; the ensemble, which is IPO without its domains, as well."""
     of = partial(arm, method="ipo", train_colors=tuple(train_colors))
+    without = partial(of, method="ensemble", learning_rate=5e-4, num_updates=num_updates)
     return [
         of("ipo_phi_short", num_updates=math.ceil(num_updates / 2), variable_phi=True),
         of("ipo_inner2", num_updates=num_updates, num_inner_rounds=2),
         of("ipo_phi", num_updates=num_updates, variable_phi=True),
         of("ipo_phi_inner2", num_updates=num_updates, variable_phi=True, num_inner_rounds=2),
+        without("ensemble_inner2", num_inner_rounds=2),
+        without("ensemble_phi", variable_phi=True),
     ]
 
 
