@@ -45,6 +45,7 @@ RULES = {
         comparisons.better,
         comparisons.because_of_the_game,
         keys.smaller_spread,
+        keys.not_better,
         keys.degrades,
         door.most_policies,
         door.viable,

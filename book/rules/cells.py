@@ -25,6 +25,8 @@ NAMES = {
     "ppo": "PPO",
     "ipo": "IPO",
     "ensemble": "the ensemble with pooled data",
+    "ipo_phi": "IPO with variable Φ",
+    "ipo_inner2": "IPO with K = 2",
     "irmv1": "IRMv1",
     "irm_game_fixed_phi": "IRM-Games, fixed Φ",
     "irm_game_variable_phi": "IRM-Games, variable Φ",

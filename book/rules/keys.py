@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 
 from rules.cells import Cells, label, paper_effect
-from rules.verdicts import Compared, Finding, compare
+from rules.verdicts import Compared, Finding, compare, holds
 
 
 def smaller_spread(
@@ -45,6 +45,21 @@ def narrower(
     """By how much values are nearer to their median than the baseline's are to theirs."""
     own, others = ((runs - runs.median()).abs() for runs in (values, baseline))
     return compare(others, own, effect, paired)
+
+
+def not_better(
+    cells: Cells, paper: pd.DataFrame, method: str, baseline: str, domain: str, metric: str
+) -> Finding:
+    """The method is not better than the baseline beyond chance."""
+    ours, theirs = (
+        cells.runs(method=name, domain=domain, metric=metric) for name in (method, baseline)
+    )
+    found = compare(ours, theirs)
+    evidence = (
+        f"{label(method)} has {ours.mean():.3f} on {domain}, {label(baseline)} "
+        f"{theirs.mean():.3f}: {found.text()}"
+    )
+    return Finding(holds(found.difference.low <= 0), evidence)
 
 
 def degrades(

@@ -27,6 +27,7 @@ NAMES = {
     "ensemble_inner2": "ensemble, K = 2",
     "ensemble_phi": "ensemble, variable Φ",
 }
+ASKED_AGAIN = ("ipo_phi", "ipo_inner2")  # as many frames; in more runs, after a first look
 
 
 def full_arms(num_updates: int, train_colors: Sequence[str] = TRAINED) -> list[Cell]:
@@ -51,9 +52,14 @@ def num_frames(cell: Cell) -> int:
 
 
 def difference(rows: pd.DataFrame, label: str, other: str = "ipo") -> str:
-    """The difference on grey to another arm, IPO as published, in the runs that an arm has."""
-    runs = rows.loc[rows["method"] == label, "run"]
-    return gap(rows[rows["run"].isin(runs)], label, other)
+    """The difference on grey to another arm, IPO as published, in the runs that both have."""
+    runs, others = (set(rows.loc[rows["method"] == arm, "run"]) for arm in (label, other))
+    return gap(rows[rows["run"].isin(runs & others)], label, other)
+
+
+def at_equal_frames(rows: pd.DataFrame, runs: Sequence[int]) -> str:
+    """A variable Phi beside K = 2 in some runs; nothing to say of fewer than two."""
+    return difference(rows[rows["run"].isin(runs)], *ASKED_AGAIN) if len(runs) > 1 else "–"
 
 
 def full_table(rows: pd.DataFrame, num_updates: int, train_colors: Sequence[str]) -> pd.DataFrame:

@@ -384,7 +384,9 @@ KEYS = ["method", "train_colors", "color_encoding", "size", "run", "domain", "me
 AS_IN_THE_PAPER = {("ppo", "grey"): (0.80, 0.12), ("ipo", "grey"): (0.85, 0.03)}
 
 
-def write_keys(data: Path, cells: dict[tuple[str, str], tuple[float, float]]) -> None:
+def write_keys(
+    data: Path, cells: dict[tuple[str, str], tuple[float, float]], name: str = "keys/main"
+) -> None:
     """A hundred runs of every cell, with this mean and spread, for both metrics."""
     lines = []
     for (method, domain), (mean, spread) in cells.items():
@@ -392,7 +394,7 @@ def write_keys(data: Path, cells: dict[tuple[str, str], tuple[float, float]]) ->
             for run in range(100):
                 value = mean + spread * scipy.stats.norm.ppf((run + 0.5) / 100)
                 lines.append((method, "red+green", "integer", 5, run, domain, metric, value))
-    store_rows(data, "keys/main", pd.DataFrame(lines, columns=KEYS))
+    store_rows(data, name, pd.DataFrame(lines, columns=KEYS))
 
 
 def training_colors(mean: float) -> dict:
@@ -456,6 +458,16 @@ def test_better_in_the_worst_colour_or_not(empty, ipo, expected):
     worst = {("ppo", "grey"): (0.80, 0.1), ("ipo", "grey"): (ipo, 0.101)}
     write_keys(empty, training_colors(0.94) | worst)
     assert verdict(empty, "keys-worst") == expected
+
+
+@pytest.mark.parametrize(
+    ("with_phi", "expected"),
+    [(0.79, claims.CONTRADICTED), (0.75, claims.REPRODUCED), (0.70, claims.REPRODUCED)],
+)
+def test_updating_the_convolutions_has_a_benefit_or_not(empty, with_phi, expected):
+    arms = {("ipo_phi", "grey"): (with_phi, 0.1), ("ipo_inner2", "grey"): (0.75, 0.101)}
+    write_keys(empty, arms, "keys/in_full")
+    assert verdict(empty, "keys-no-benefit") == expected
 
 
 @pytest.mark.parametrize(

@@ -313,10 +313,14 @@ SHIPPED = {
         for length in ("", "_long")
     },
     "in_full": {
-        ("ipo_inner2", TWO, "integer", 5): 25,
         ("ipo_phi_short", TWO, "integer", 5): 50,
+        ("ipo_inner2", TWO, "integer", 5): 100,
+        ("ipo_phi", TWO, "integer", 5): 100,
+        ("ipo_phi_inner2", TWO, "integer", 5): 50,
+        ("ensemble_inner2", TWO, "integer", 5): 50,
+        ("ensemble_phi", TWO, "integer", 5): 50,
     },
-    "regularized": {(label, TWO, "integer", 5): 25 for label in trials.KEYS.settings},
+    "regularized": {(label, TWO, "integer", 5): 50 for label in trials.KEYS.settings},
     "curves": {(method, TWO, "integer", 5): 30 for method in ("ppo", "ipo", "ensemble")},
     "fair": {
         (method, TWO, "integer", 5): 50
@@ -670,8 +674,8 @@ def test_frames_of_the_algorithm_in_full_are_counted_as_training_counts_them(tab
         *_, (frames, _) = task.train(tiny, [0])
         assert keys_in_full.num_frames(tiny) == frames
     assert [keys_in_full.num_frames(arm) for arm in keys_in_full.full_arms(20)] == [
-        245_760,
-        122_880,
+        *(122_880, 245_760, 245_760, 368_640),
+        *(245_760, 245_760),
     ]
 
 
