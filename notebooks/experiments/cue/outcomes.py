@@ -58,6 +58,15 @@ def _means(runs: pd.DataFrame) -> pd.DataFrame:
     return runs.groupby(level=["encoding", "cues", "method"]).mean()
 
 
+def in_training(runs: pd.DataFrame) -> pd.Series:
+    """Mean return in the training domains, of every arm at every point."""
+    mean = _means(runs)
+    cues = [
+        np.mean([float(c) for c in text.split()]) for text in mean.index.get_level_values("cues")
+    ]
+    return mean["plain"] + np.array(cues) * mean["use"] / 2
+
+
 def follows(worst: float, plain: float) -> str:
     """What the policies of an arm follow at a point, by their mean returns."""
     if worst < HALF:
