@@ -462,7 +462,7 @@ def tensors(**arrays) -> dict[str, torch.Tensor]:
 
 DAMAGE = {
     "truncated": lambda path: path.write_bytes(path.read_bytes()[:-9]),
-    "changed": lambda path: path.write_bytes(path.read_bytes()[:-9] + bytes(9)),
+    "changed": lambda path: path.write_bytes(path.read_bytes()[:-9] + b"?" * 9),
     "empty": lambda path: path.write_bytes(b""),
     "without a seal": lambda path: path.write_bytes(read_sealed(path)),
     "other keys": lambda path: write_tensors(path, tensors(images=np.zeros(3)), "made_by", ""),
