@@ -143,9 +143,12 @@ def check_network(network: Network, observations: Space, actions: Space) -> None
 
 def _read(file: BinaryIO) -> dict[str, np.ndarray]:
     """All arrays; they take no more memory than the file is long."""
+    size = os.fstat(file.fileno()).st_size
+    if not size:  # or it is a device, which zipfile might read for ever
+        raise ValueError("it is empty")
     with zipfile.ZipFile(file) as archive:
         parts = archive.infolist()
-        if sum(part.file_size for part in parts) > file.seek(0, os.SEEK_END):
+        if sum(part.file_size for part in parts) > size:
             raise ValueError("it would unpack to more than it is")
         arrays = {part.filename.removesuffix(".npy"): _array(archive.read(part)) for part in parts}
     if arrays.get("format") != FORMAT:
