@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import errno
+import os
 import shutil
 import sys
 import tempfile
@@ -22,6 +24,7 @@ from profiles import load_notebooks
 from website import build_site
 
 ROOT = Path(__file__).resolve().parents[1]
+NO_SPACE = os.strerror(errno.ENOSPC)
 UNFINISHED = ("_executed/*/*.running.*", "_executed/*/*.tmp", "_build/*.tmp")
 
 
@@ -30,9 +33,16 @@ def main(arguments: list[str] | None = None, root: Path = ROOT) -> int:
     options = parse(arguments, root)
     interrupt_on_sigterm()
     try:
-        return build(root, options)
-    except BuildError as error:
+        build(root, options)
+        return 0
+    except (BuildError, OSError) as error:
+        is_full = NO_SPACE in str(error)
+        if isinstance(error, OSError) and not is_full:
+            raise
         print(error, file=sys.stderr)
+        if is_full:
+            where = shown(options.output)
+            print(f"{where}: {NO_SPACE}; the last good site is untouched", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         print("Interrupted; the last good site is untouched", file=sys.stderr)
@@ -54,7 +64,7 @@ def parse(arguments: list[str] | None, root: Path) -> argparse.Namespace:
     return options
 
 
-def build(root: Path, options: argparse.Namespace) -> int:
+def build(root: Path, options: argparse.Namespace) -> None:
     """All steps, and how long each took."""
     output = options.output.resolve()
     executed = output / "_executed" / options.profile
@@ -64,7 +74,7 @@ def build(root: Path, options: argparse.Namespace) -> int:
     make_folders(output / "_build", executed)
     with alone(output):
         remove_unfinished(output)
-        return execute_and_build(root, output, notebooks, options)
+        execute_and_build(root, output, notebooks, options)
 
 
 def only(chapter: str, notebooks: list) -> list:
@@ -116,15 +126,14 @@ def remove_unfinished(output: Path) -> None:
 
 def execute_and_build(
     root: Path, output: Path, notebooks: list, options: argparse.Namespace
-) -> int:
+) -> None:
     steps = []
     if options.setup_seconds is not None:
         steps.append(("set-up", f"{options.setup_seconds:.1f} s"))
     changed = [notebook for notebook in notebooks if not notebook.is_current()]
     failures = execute(changed, options.jobs)
     if failures:
-        print("\n\n".join(failures), file=sys.stderr)
-        return 1
+        raise BuildError("\n\n".join(failures))
     for notebook in notebooks:
         took = f"{notebook.read_record()['seconds']:.1f} s" if notebook in changed else "unchanged"
         steps.append((f"notebooks/{notebook.name}.ipynb", took))
@@ -141,7 +150,6 @@ def execute_and_build(
     for name, took in steps:
         print(f"{name:<{width}}  {took:>9}")
     print(result)
-    return 0
 
 
 if __name__ == "__main__":

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
+import shutil
 import subprocess
 import sys
 import time
@@ -21,6 +23,7 @@ from messages import for_terminal, shown
 from outputs import cells_of_source, first_line, last_started, run_record, with_outputs
 
 WORKER = "import json, papermill; papermill.execute_notebook(**json.loads(sys.argv[1]))"
+LEAST_FREE = 2**20  # bytes of a disk that is not full
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -88,11 +91,16 @@ class Run:
         if not self.raw.exists():
             return f"{self.notebook.name} could not be started:\n{log}"
         self.raw.replace(self.notebook.failed)
-        raw = nbformat.read(self.notebook.failed, as_version=4)
+        try:
+            raw = nbformat.read(self.notebook.failed, as_version=4)
+        except ValueError:  # papermill writes it anew after every cell, or could not
+            free = shutil.disk_usage(self.notebook.folder).free
+            cause = log or (os.strerror(errno.ENOSPC) if free < LEAST_FREE else "no message")
+            return f"{self.notebook.name} ended while it was written: {cause}"
         number, cell = last_started(raw)
         errors = [output for output in cell.get("outputs", []) if output.output_type == "error"]
         # Without an error in the cell, its kernel died; papermill's last line says so.
-        traceback = "\n".join(errors[-1].traceback) if errors else log.splitlines()[-1]
+        traceback = "\n".join(errors[-1].traceback) if errors else log.rpartition("\n")[-1]
         return (
             f"{self.notebook.name}, cell {number} failed: {first_line(cell)}\n"
             f"{for_terminal(traceback)}\n"

@@ -26,10 +26,18 @@ ROWS = {
     "exercises": {"keys.csv": "keys/main.csv", "doors.csv": "door/strategies.csv"},
     "homework": {"keys.csv": "keys/main.csv"},
 }
+WITHOUT_SOLUTIONS = (
+    "notebooks/exercises is missing, of which packages are made: the archive that the site offers "
+    "has no solutions. The package for students is in its book/_downloads; the one for instructors "
+    "needs a clone of the repository"
+)
 OLDEST = (1980, 1, 1, 0, 0, 0)  # date of every file in an archive: the same files, the same bytes
 
 
 def main() -> int:
+    if not SOURCES.exists():
+        print(WITHOUT_SOLUTIONS, file=sys.stderr)
+        return 1
     target = ROOT / "book" / "_build" / "teaching"
     target.mkdir(parents=True, exist_ok=True)
     try:

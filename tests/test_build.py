@@ -1,6 +1,8 @@
 """The build, on a toy project of two notebooks: what it executes, refuses, keeps and hides."""
 
+import errno
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -13,6 +15,7 @@ import setup
 from toy_book import CELLS, in_toy, write_notebook, write_toy
 
 import build
+import execute
 import website
 from build import main
 from chapters import tree_hash
@@ -225,6 +228,43 @@ def test_folder_that_cannot_be_written_is_named_with_the_cause(toy, capsys):
     error = capsys.readouterr().err
     assert "environment.txt/folder/_build cannot be written: Not a directory" in error
     assert "--output" in error
+
+
+def test_a_full_disk_is_named_and_leaves_the_last_good_site(toy, capsys, monkeypatch):
+    def full(*folders: Path) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(toy / "page"))
+
+    pages = tree_hash(toy / "book/_build/html")
+    (toy / "book/intro.md").write_text("# Another toy\n\nSee [](plain.ipynb).\n")
+    for step in ("stage", "run_jupyter_book", "finish"):
+        with monkeypatch.context() as patch:
+            patch.setattr(website, step, full)
+            if step == "finish":
+                patch.setattr(website, "run_jupyter_book", lambda source, output: output)
+                patch.setattr(website.decks, "build", lambda *_: None)
+            assert main([], toy) == 1
+        assert "book: No space left on device; the last good site" in capsys.readouterr().err
+        assert tree_hash(toy / "book/_build/html") == pages
+
+
+def test_a_notebook_that_is_not_written_whole_is_named(toy, capsys, monkeypatch):
+    worker = (
+        "import json; open(json.loads(sys.argv[1])['output_path'], 'w').write('{'); sys.exit(1)"
+    )
+    monkeypatch.setattr(execute, "WORKER", worker)
+    monkeypatch.setattr(execute, "LEAST_FREE", float("inf"))
+    executed(toy, "plain.json").unlink()
+    assert main(["--chapter", "plain"], toy) == 1
+    assert "plain ended while it was written: No space left" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["book", "book/_build", "book/_executed"])
+def test_a_link_to_a_folder_elsewhere_is_a_folder(toy, tmp_path, name):
+    (toy / name).rename(tmp_path / "elsewhere")
+    (toy / name).symlink_to(tmp_path / "elsewhere")
+    before = tree_hash(tmp_path / "elsewhere")
+    assert main([], toy) == 0
+    assert (toy / name).is_symlink() and tree_hash(tmp_path / "elsewhere") == before
 
 
 # ------------------------------------------------------------- two at once, and what was killed

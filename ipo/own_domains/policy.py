@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import io
 import os
 import zipfile
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 import torch
@@ -75,7 +76,7 @@ class Policy:
 
     @classmethod
     def load(cls, path: str | os.PathLike, network: Network | None = None) -> Policy:
-        """What ``save`` wrote. No code of the file is executed; a damaged one is an error of zip.
+        """What ``save`` wrote. No code of the file is executed.
 
         Args:
             path: of the file.
@@ -83,22 +84,21 @@ class Policy:
                 :func:`ipo.own_domains.policy.network_for`.
 
         Raises:
-            ValueError: a file of something else, or of another network.
+            ValueError: a file that is damaged, of something else, or of another network.
         """
-        arrays = {}
-        if zipfile.is_zipfile(path):
-            with np.load(path) as file:
-                arrays = dict(file)
-        if arrays.get("format") != FORMAT:
-            raise ValueError(f"path = {os.fspath(path)!r}: is no file that Policy.save wrote")
-        spaces = _space("observations", arrays), _space("actions", arrays)
-        network = network or network_for(*spaces)
-        check_network(network, *spaces)
-        weights = {
-            key.removeprefix("weights."): torch.from_numpy(array)  # [E, R, ...]
-            for key, array in arrays.items()
-            if key.startswith("weights.")
-        }
+        with open(path, "rb") as file:
+            try:
+                arrays = _read(file)
+                spaces = _space("observations", arrays), _space("actions", arrays)
+                weights = _weights(arrays)
+            except Exception as error:  # zip, zlib, NumPy, gymnasium: each has its own
+                raise ValueError(
+                    f"path = {os.fspath(path)!r}: is no file that Policy.save wrote: {error}"
+                ) from error
+        if network is None:
+            network = network_for(*spaces)
+        else:
+            check_network(network, *spaces)
         shapes = {name: tuple(w.shape[2:]) for name, w in weights.items()}
         if shapes != network.weight_shapes:
             raise ValueError(
@@ -139,6 +139,44 @@ def check_network(network: Network, observations: Space, actions: Space) -> None
     num_choices = parameters.shape[-1] if isinstance(actions, Discrete) else None
     if action.shape != actions.shape or num_choices != getattr(actions, "n", None):
         raise ValueError(f"network: {name} must give actions {actions}")
+
+
+def _read(file: BinaryIO) -> dict[str, np.ndarray]:
+    """All arrays; they take no more memory than the file is long."""
+    size = os.fstat(file.fileno()).st_size
+    if not size:  # or it is a device, which zipfile might read for ever
+        raise ValueError("it is empty")
+    with zipfile.ZipFile(file) as archive:
+        parts = archive.infolist()
+        if sum(part.file_size for part in parts) > size:
+            raise ValueError("it would unpack to more than it is")
+        arrays = {part.filename.removesuffix(".npy"): _array(archive.read(part)) for part in parts}
+    if arrays.get("format") != FORMAT:
+        raise ValueError(f"its format is not {FORMAT!r}")
+    return arrays
+
+
+def _array(content: bytes) -> np.ndarray:
+    """As ``np.savez`` writes one. NumPy's reader takes memory for what the header claims."""
+    file = io.BytesIO(content)
+    np.lib.format.read_magic(file)
+    shape, is_fortran, dtype = np.lib.format.read_array_header_1_0(file)
+    values = np.frombuffer(bytearray(file.read()), dtype)
+    return values.reshape(shape, order="F" if is_fortran else "C")
+
+
+def _weights(arrays: dict[str, np.ndarray]) -> Weights:
+    """Those of all players ``[E, R, ...]``, a run for each seed."""
+    weights = {
+        key.removeprefix("weights."): torch.from_numpy(array)
+        for key, array in arrays.items()
+        if key.startswith("weights.")
+    }
+    seeds = arrays["seeds"]
+    [(_, num_runs)] = {tuple(weight.shape[:2]) for weight in weights.values()}
+    if seeds.dtype.kind != "i" or seeds.shape != (num_runs,):
+        raise ValueError(f"it has {num_runs} runs, and not as many whole numbers as seeds")
+    return weights
 
 
 def _bounds(name: str, space: Space) -> dict[str, Any]:

@@ -94,7 +94,10 @@ def _new(path: Path) -> Path:
 
 def _read(path: Path) -> Any:
     tensors, plain = read_tensors(path, "tree")
-    return _put_tensors(plain, tensors)
+    try:
+        return _put_tensors(plain, tensors)
+    except (KeyError, RecursionError) as error:
+        raise DamagedError(f"{path}: holds no tree with its tensors: {error}") from error
 
 
 def _take_tensors(tree: Any, name: str, tensors: dict[str, torch.Tensor]) -> Any:

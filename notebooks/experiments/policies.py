@@ -93,7 +93,9 @@ def _weights_of(path: str | Path, d: int, tensors: Mapping[str, Any], network: N
     return player
 
 
-def _check_made_for(path: str | Path, found: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
+def _check_made_for(path: str | Path, found: Any, wanted: Mapping[str, Any]) -> None:
+    if not isinstance(found, dict):
+        raise ValueError(f"{path}: must say what it was made for")
     recorded = {name: found.get(name) for name in wanted}
     for name, value in wanted.items():
         if dataclasses.is_dataclass(value):

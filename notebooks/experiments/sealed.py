@@ -22,6 +22,17 @@ class DamagedError(ValueError):
     """A file that is not what was written."""
 
 
+def read_whole(path: Path) -> bytes:
+    """All of a file.
+
+    Raises:
+        DamagedError: a link, say, to a pipe or a device, which may have no end.
+    """
+    if path.exists() and not path.is_file():
+        raise DamagedError(f"{path}: is no file that can be read to its end")
+    return path.read_bytes()
+
+
 def write_sealed(path: Path, content: bytes) -> None:
     """Replace the file, and its folder if need be, by the content behind its seal."""
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -34,7 +45,7 @@ def read_sealed(path: Path) -> bytes:
     Raises:
         DamagedError: a file that is cut short or changed, or that never had a seal.
     """
-    whole = path.read_bytes()
+    whole = read_whole(path)
     seal, content = whole[:SEAL_LENGTH], whole[SEAL_LENGTH:]
     if seal != _seal(content):
         raise DamagedError(f"{path}: is cut short or changed, and cannot be used")
@@ -60,7 +71,7 @@ def read_record(path: Path) -> dict[str, Any]:
         DamagedError: a file that is cut short or changed, or that never had a seal.
     """
     try:
-        record = dict(json.loads(path.read_bytes()))
+        record = dict(json.loads(read_whole(path)))
     except (ValueError, TypeError, RecursionError) as error:
         raise DamagedError(f"{path}: is cut short or changed: {error}") from error
     if record.pop(SEAL, None) != _seal_of(record):

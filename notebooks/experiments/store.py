@@ -17,6 +17,7 @@ import hashlib
 import io
 import itertools
 import json
+import os
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -33,7 +34,7 @@ from experiments import origin
 from experiments.experiment import Cell, Experiment, difference, filled, plain
 from experiments.files import check_file_name, replace_text
 from experiments.rows import ResultsError, check_rows, types_of
-from experiments.sealed import DamagedError, digest_of, read_record, write_record
+from experiments.sealed import DamagedError, digest_of, read_record, read_whole, write_record
 from experiments.work import finished
 from ipo.checks import Seeds, check_count, checked
 
@@ -176,8 +177,8 @@ class Store:
         if not batches:  # or killed before the first batch was saved whole
             return NO_ROWS, []
         try:
-            return self._parsed(self.csv.read_bytes(), types, batches), batches
-        except OSError as error:
+            return self._parsed(read_whole(self.csv), types, batches), batches
+        except (OSError, DamagedError) as error:
             raise ResultsError(f"{self.json.with_suffix('')}: cannot be read: {error}") from error
 
     def _parsed(self, csv: bytes, types: dict[str, str], batches: list[Batch]) -> pd.DataFrame:
@@ -202,8 +203,8 @@ class Store:
 
     def _record(self) -> tuple[dict[str, str], list[Batch]]:
         """The types of the columns of the rows that there are, and the batches."""
-        if not self.json.exists():
-            if self.csv.exists():
+        if not os.path.lexists(self.json):  # a link that leads nowhere is not nothing
+            if os.path.lexists(self.csv):
                 raise ResultsError(
                     f"{self.csv}: has no {self.json.name} beside it that says where it comes from"
                 )

@@ -3,24 +3,23 @@
 from __future__ import annotations
 
 import hashlib
-import io
 import json
 import warnings
-import zipfile
 from collections.abc import Callable
 from dataclasses import fields
 from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
+import torch
 from filelock import FileLock
 from gymnasium import Env
 
-from experiments.sealed import read_sealed, write_sealed
+from experiments.sealed import DamagedError
+from experiments.tensors import read_tensors, write_tensors
 from ipo.worlds.tabular import TabularTask, goal_reward, state_of, tabulate
 
-# A file that is damaged or has objects; of code with other fields; no archive; larger than memory.
-UNUSABLE = (ValueError, KeyError, EOFError, zipfile.BadZipFile, MemoryError)
+FORM = "tensors"  # of the files; those of another one are not looked at
 NUM_STEPS = 200  # of random episodes in which a table and its environment are compared
 
 
@@ -34,7 +33,7 @@ def load_or_tabulate(make_env: Callable[..., Env], folder: str | Path, **options
     Where the folder cannot be written, the table is made each time, with a warning.
     """
     made_by = f"{make_env.__module__}.{make_env.__qualname__}"
-    key = json.dumps([made_by, options, version("minigrid")], sort_keys=True)
+    key = json.dumps([made_by, options, version("minigrid"), FORM], sort_keys=True)
     path = Path(folder) / f"{hashlib.sha256(key.encode()).hexdigest()[:16]}.table"
     env = make_env(**options)
     task = None
@@ -44,7 +43,8 @@ def load_or_tabulate(make_env: Callable[..., Env], folder: str | Path, **options
             task = _kept(path, env)
             if task is None:
                 task = tabulate(env)
-                write_sealed(path, _archive(task))
+                tensors = {name: torch.from_numpy(array) for name, array in vars(task).items()}
+                write_tensors(path, tensors, "made_by", made_by)
     except OSError as error:  # a checkout that is read-only, or a full disk
         kept = _kept(path, env)
         if kept is None:
@@ -82,15 +82,9 @@ def _kept(path: Path, env: Env) -> TabularTask | None:
     if not path.exists():
         return None
     try:
-        with np.load(io.BytesIO(read_sealed(path))) as arrays:
-            task = TabularTask(**{field.name: arrays[field.name] for field in fields(TabularTask)})
-    except UNUSABLE as error:
+        tensors, _ = read_tensors(path, "made_by")
+        task = TabularTask(**{f.name: tensors[f.name].numpy() for f in fields(TabularTask)})
+    except (DamagedError, KeyError) as error:  # KeyError: of code with other fields
         warnings.warn(f"{path}: is made anew: {error}", TableWarning, stacklevel=3)
         return None
     return task if agrees(task, env) else None
-
-
-def _archive(task: TabularTask) -> bytes:
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, **vars(task))
-    return buffer.getvalue()

@@ -29,7 +29,8 @@ def read_tensors(path: Path, name: str) -> tuple[dict[str, torch.Tensor], Any]:
     """
     content = read_sealed(path)
     try:
+        tensors = safetensors.torch.load(content)
         header = json.loads(content[8 : 8 + int.from_bytes(content[:8], "little")])
-        return safetensors.torch.load(content), json.loads(header["__metadata__"][name])
-    except (safetensors.SafetensorError, KeyError, ValueError) as error:
+        return tensors, json.loads(header["__metadata__"][name])
+    except (safetensors.SafetensorError, KeyError, ValueError, RecursionError) as error:
         raise DamagedError(f"{path}: holds no {name!r} with its tensors: {error}") from error

@@ -8,6 +8,8 @@ import json
 import pickle
 import shutil
 import tempfile
+import time
+import tracemalloc
 import warnings
 import zipfile
 from collections.abc import Callable, Iterator
@@ -28,16 +30,20 @@ import website
 from experiments.checkpoints import load_checkpoint, save_checkpoint
 from experiments.doors.authors_policies import load_authors_policy
 from experiments.paper import read_paper
+from experiments.policies import load_policy
 from experiments.sealed import DamagedError, read_record, write_sealed
 from experiments.store import Store
 from experiments.tabulated import load_or_tabulate
 from experiments.tensors import read_tensors
+from ipo.own_domains import Policy
 from ipo.worlds.colored_keys import ColoredKeysEnv
+from ipo.worlds.networks import GridNetwork
 from messages import BuildError
 from profiles import load_notebooks
 
 DATA = ROOT / "data"
 Read = Callable[[Path], Any]
+MOST_SECONDS, MOST_BYTES = 1.0, 2**25  # that a file may take which is refused
 
 
 # ------------------------------------------------------------------------------ readers
@@ -55,6 +61,10 @@ def read_policy(path: Path) -> str:
 
 def read_checkpoint(path: Path) -> str:
     return repr(load_checkpoint(path))
+
+
+def read_own_policy(path: Path) -> str:
+    return repr(Policy.load(path))
 
 
 def read_table(path: Path) -> bytes:
@@ -170,30 +180,43 @@ class Harm:
         return Path.touch, (self.path,)
 
 
-def huge_tensors() -> bytes:
-    """Tensors larger than any memory, by what their header says."""
-    entry = {"dtype": "F32", "shape": [2**40], "data_offsets": [0, 2**42]}
-    header = json.dumps({"__metadata__": {"about": "{}", "tree": "{}"}, "w": entry}).encode()
-    return len(header).to_bytes(8, "little") + header
+def tensors(plain: str, size: int = 1) -> bytes:
+    """A few numbers, so many by what their header says, and JSON beside them."""
+    entry = {"dtype": "F32", "shape": [size], "data_offsets": [0, 4 * size]}
+    beside = dict.fromkeys(("about", "tree", "made_by"), plain)
+    header = json.dumps({"__metadata__": beside, "w": entry}).encode()
+    return len(header).to_bytes(8, "little") + header + bytes(4)
 
 
-def huge_array() -> bytes:
-    """An archive with an array larger than any memory, by what its header says."""
+NO_TENSORS = [
+    tensors("{}", 2**40),  # larger than any memory
+    tensors("[" * 10**6),
+    tensors('["tensor:nowhere"]'),
+    (2**62).to_bytes(8, "little"),
+]
+
+
+def claimed(size: int) -> bytes:
+    """An array of so many numbers, by what its header says."""
     content = io.BytesIO()
-    np.lib.format.write_array_header_1_0(
-        content, {"descr": "<f8", "fortran_order": False, "shape": (2**50,)}
-    )
-    archive = io.BytesIO()
-    with zipfile.ZipFile(archive, "w") as file:
-        file.writestr("images.npy", content.getvalue())
-    return archive.getvalue()
+    header = {"descr": "<f8", "fortran_order": False, "shape": (size,)}
+    np.lib.format.write_array_header_1_0(content, header)
+    return b"\x93NUMPY\x01\x00" + content.getvalue()
+
+
+def archive(content: bytes) -> bytes:
+    """A zip of an array, which is packed as small as can be."""
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as parts:
+        parts.writestr("format.npy", content)
+    return file.getvalue()
 
 
 def objects(harm: Harm) -> bytes:
     """An archive with an array of objects, which are pickled."""
-    archive = io.BytesIO()
-    np.savez(archive, images=np.array([harm], dtype=object))
-    return archive.getvalue()
+    file = io.BytesIO()
+    np.savez(file, format=np.array([harm], dtype=object))
+    return file.getvalue()
 
 
 def hostile(folder: Path, generator: np.random.Generator, num: int) -> Iterator[str]:
@@ -204,21 +227,23 @@ def hostile(folder: Path, generator: np.random.Generator, num: int) -> Iterator[
     table = new_table(folder / "tables").name
     sealed = [
         (read, name, content)
-        for read, name, contents in (
-            (read_policy, "a.safetensors", [huge_tensors(), (2**62).to_bytes(8, "little")]),
-            (read_checkpoint, "a.checkpoint", [huge_tensors(), (2**62).to_bytes(8, "little")]),
-            (read_table, f"tables/{table}", [huge_array(), objects(harm)]),
+        for read, name in (
+            (partial(load_policy, network=GridNetwork()), "a.safetensors"),
+            (read_checkpoint, "a.checkpoint"),
+            (read_table, f"tables/{table}"),
         )
-        for content in (*contents, pickled, b"")
+        for content in (*NO_TENSORS, pickled, b"")
     ]
     for read, name, content in sealed:
         write_sealed(folder / name, content)
         yield _refused(read, folder / name, harm)
+    archives = [archive(claimed(2**31)), archive(bytes(2**28)), objects(harm)]
     plain = [
         (read_policy, "b.safetensors", pickled),
         (read_checkpoint, "b.checkpoint", pickled),
         (read_table, f"tables/{table}", pickled),
         (load_authors_policy, "authors.pt", pickled),
+        *((read_own_policy, "own.npz", c) for c in (*archives, pickled, b"")),
         (read_rows, "rows.json", pickled),
         (read_rows, "rows.json", b"[" * 10**6),
         (read_record, "confirmed.json", b'{"a":' * 10**6),
@@ -227,11 +252,26 @@ def hostile(folder: Path, generator: np.random.Generator, num: int) -> Iterator[
     for read, name, content in plain:
         (folder / name).write_bytes(content)
         yield _refused(read, folder / name, harm)
+    copied(ROWS, "linear.csv", folder / "results")
+    endless = {name: read for read, name, _ in (*sealed, *plain[:-1])}  # claims.yml is ours
+    for name, read in (endless | {"results/linear.csv": read_rows}).items():
+        (folder / name).unlink()
+        (folder / name).symlink_to("/dev/zero")
+        yield _refused(read, folder / name, harm)
 
 
 def _refused(read: Read, path: Path, harm: Harm) -> str:
+    """Whether a reader refuses a file at once, without the memory that it is to take."""
+    tracemalloc.start()
+    began = time.monotonic()
     found = outcome(read, path, expected=None)
-    return "its code was executed" if harm.path.exists() else found
+    seconds, (_, most) = time.monotonic() - began, tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    if harm.path.exists():
+        return "its code was executed"
+    if seconds > MOST_SECONDS or most > MOST_BYTES:
+        return f"took {seconds:.1f} s and {most} bytes: {found}"
+    return found
 
 
 def flips(where: str, make: Callable[[Path], Path], read: Read, num: int = 60) -> tuple:

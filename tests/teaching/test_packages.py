@@ -86,7 +86,9 @@ def test_the_download_is_made_once(tmp_path, monkeypatch):
     assert len({(site / "_downloads" / "ipo-exercises.zip").read_bytes() for site in sites}) == 1
 
 
-def test_a_copy_without_solutions_brings_the_package(tmp_path, monkeypatch):
+def test_a_copy_without_solutions_brings_the_package_and_says_so(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(teaching, "SOURCES", tmp_path / "left out")
+    assert teaching.main() == 1
+    assert "notebooks/exercises is missing" in capsys.readouterr().err
     teaching.write_download(tmp_path / "site", tmp_path)
     assert not list(tmp_path.iterdir())

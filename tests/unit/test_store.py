@@ -251,6 +251,24 @@ def test_damaged_file_is_named_and_not_changed(folder, damage, message):
     assert contents(folder) == before
 
 
+@pytest.mark.parametrize("target", ["nowhere", "itself", "/dev/zero"])
+@pytest.mark.parametrize("name", ["toy.csv", "toy.json"])
+def test_a_link_that_leads_to_no_file_is_named(folder, name, target):
+    (folder / name).unlink()
+    (folder / name).symlink_to(name if target == "itself" else target)
+    calls = Calls()
+    with pytest.raises(ResultsError, match=rf"toy: cannot be read: .*{name}"):
+        fill(folder, run=calls)
+    assert calls.asked == [] and (folder / name).is_symlink()
+
+
+def test_a_link_to_results_is_as_good_as_they_are(folder, complete):
+    (folder / "toy.csv").unlink()
+    (folder / "toy.csv").symlink_to(complete / "toy.csv")
+    calls = Calls()
+    assert fill(folder, run=calls).equals(fill(complete)) and calls.asked == []
+
+
 @pytest.mark.parametrize("inside", [".", "deeper/still"])
 def test_folder_that_cannot_be_written_is_named_before_any_work(tmp_path, inside):
     (tmp_path / "file").write_text("not a folder")
