@@ -13,8 +13,9 @@ from finish.access import make_accessible
 from finish.equations import set_equations
 from finish.icons import svg
 from finish.lean import make_lean, remove_source_maps
+from finish.minus import set_minus
 from finish.pictures import adapt_pictures
-from finish.tables import keep_intervals
+from finish.tables import fit_tables
 from messages import BuildError
 
 
@@ -93,10 +94,61 @@ def test_a_figure_gets_a_twin_for_dark_mode(tmp_path):
 
 
 def test_cells_wrap_around_intervals_only():
-    one = page('<table class="bd-article"><tr><td>0.75 [0.7, 0.8]</td><td>9 ± 1</td></tr></table>')
-    keep_intervals(page=one)
+    cells = "<tr><td>0.75 [0.7, 0.8]</td><td>9 ± 1</td></tr>"
+    one = page(f'<div class="bd-article"><table>{cells}</table></div>')
+    fit_tables(one)
     assert [whole.get_text() for whole in one.select("td > .interval")] == ["[0.7, 0.8]", "9 ± 1"]
     assert one.td.get_text() == "0.75 [0.7, 0.8]"
+
+
+def table(heads: list[str], *rows: list[str]) -> BeautifulSoup:
+    head, *body = (
+        "<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>" for row in (heads, *rows)
+    )
+    html = f"<table><thead>{head}</thead><tbody>{''.join(body)}</tbody></table>"
+    return page(f'<div class="bd-article">{html}</div>')
+
+
+def test_only_a_table_that_is_too_wide_for_a_phone_is_stacked():
+    narrow, wide = (table(["arm", *["12345"] * num], ["IPO", *["0.93"] * num]) for num in (6, 7))
+    for one in (narrow, wide):
+        fit_tables(one)
+    assert not narrow.select(".stacked, [data-label]")
+    assert [cell["data-label"] for cell in wide.select(".stacked tbody td")][:2] == ["arm", "12345"]
+
+
+def test_words_have_a_line_of_their_own_and_empty_cells_no_name():
+    words = "a sentence that is longer than a third of a line"
+    one = table(["what", "incomprehensibilities", "n", "p"], [words, words, "", "incomprehensible"])
+    fit_tables(one)
+    what, long, empty, short = one.select("tbody td")
+    assert long["class"] == ["long"] and "class" not in short.attrs
+    assert "data-label" not in empty.attrs and short["data-label"] == "p"
+
+
+def test_columns_are_counted_from_the_last_where_a_cell_spans_rows():
+    one = table(["method", "of", "a column of numbers that is wide"], ["IPO", "ours", "1 ± 1"])
+    one.tbody.append(BeautifulSoup("<tr><td>paper</td><td>2</td></tr>", "html.parser"))
+    one.tbody.tr.td["rowspan"] = "2"
+    one.tbody.tr.find_all("td")[2].string = "x" * 40
+    fit_tables(one)
+    labels = [[cell["data-label"] for cell in row.select("td")] for row in one.select("tbody tr")]
+    assert labels[1] == labels[0][1:] and labels[1][0] == "of"
+
+
+@pytest.mark.parametrize(
+    ("typed", "shown"),
+    [
+        ("-0.03 [-1, -.5]", "−0.03 [−1, −.5]"),
+        ("-0.00, [-0, 1]", "0.00, [0, 1]"),
+        ("2026-11-27, 5e-4, x^-1, Okabe-Ito, 1-2", "2026-11-27, 5e-4, x^-1, Okabe-Ito, 1-2"),
+    ],
+)
+def test_negative_numbers_have_a_minus_sign(typed, shown):
+    one = page(f"<p>{typed}</p><code>{typed}</code>")
+    set_minus(one)
+    assert one.p.get_text() == shown
+    assert one.code.get_text() == typed
 
 
 def test_the_archive_has_the_sources_and_no_solutions(tmp_path):
