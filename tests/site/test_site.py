@@ -164,6 +164,28 @@ def test_no_table_scrolls(browser, built_site, page_names, viewport):
     assert {name: tables for name, tables in wide.items() if tables} == {}
 
 
+# Pixels of a phone for each point of a figure's width, by figure.
+SCALES = """async () => {
+  const shown = [...document.querySelectorAll('.picture img')].filter(i => i.checkVisibility());
+  shown.forEach(picture => { picture.loading = 'eager'; });
+  await Promise.all(shown.map(picture => picture.decode()));
+  return shown.map(picture => ({
+    scale: picture.clientWidth / (.75 * picture.naturalWidth), alt: picture.alt.slice(0, 60)}));
+}"""
+SMALL_LETTERS = 9.6  # points
+
+
+def test_letters_of_figures_are_seven_pixels_high_on_a_phone(browser, built_site, page_names):
+    with new_context(browser, PHONE) as context:
+        page = context.new_page()
+        tiny = {}
+        for name in page_names:
+            open_page(page, f"{built_site.as_uri()}/{name}")
+            shown = page.evaluate(SCALES)
+            tiny[name] = [one for one in shown if one["scale"] * SMALL_LETTERS < 7]
+    assert {name: figures for name, figures in tiny.items() if figures} == {}
+
+
 # --- weight -------------------------------------------------------------------------------------
 
 

@@ -229,7 +229,7 @@ def every_run(
             point = paper[(paper["method"] == method) & (paper["domain"] == str(f))]
             ax.scatter(place, 100 * point["mean"], s=60, facecolors="none", edgecolors="0.35")
         ax.set_title(f"friction {f}", fontsize="medium")
-        ax.tick_params(axis="x", labelsize=7, rotation=90)
+        ax.tick_params(axis="x", labelsize="small", rotation=90)
     axes[0, 0].set_ylabel("doors opened [%]")
     return fig
 
