@@ -61,8 +61,9 @@ class LQRSettings:
         phi_scale: standard deviation of the initial entries of Phi (not published).
         gain_scale: the same for the controllers behind Phi (not published).
         order: of the players of ``ipo_fixed_phi``: ``in_turn`` (Algorithm 1) or ``together``.
-        variance_penalty, scale_penalty, dropout: of ``gradient_descent``, which lowers
-            :func:`regularized_cost` where one of them is not 0.
+        variance_penalty: of ``gradient_descent``, which lowers :func:`regularized_cost` with it.
+        scale_penalty: likewise.
+        dropout: likewise, a probability.
     """
 
     method: Method

@@ -31,35 +31,36 @@ def _svg(fig: Figure) -> str:
 
 
 def make_narrow(fig: Figure) -> None:
-    """As many panels in a row as keep their width, and no fewer than one."""
+    """As many panels in a row as keep their width; what stood in one row takes some lines."""
     width, height = fig.get_size_inches()
     panels = [ax for ax in fig.axes if ax.get_subplotspec() is not None]
     num_rows, num_columns = panels[0].get_subplotspec().get_gridspec().get_geometry()
-    columns = max(1, min(num_columns, int(WIDTH / (width / num_columns))))
-    rows = math.ceil(len(panels) / columns)
-    if columns < num_columns:
-        grid = GridSpec(rows, columns, figure=fig)
+    fitting = max(1, int(WIDTH / (width / num_columns)))
+    lines = math.ceil(num_columns / fitting)
+    if lines > 1:
+        columns = math.ceil(num_columns / lines)
         _say_what_is_shared(panels, num_columns, columns)
+        grid = GridSpec(num_rows * lines, columns, figure=fig)
         for place, ax in enumerate(panels):
-            ax.set_subplotspec(grid[place])
-    fig.set_size_inches(WIDTH, height * rows / num_rows)
+            row, column = divmod(place, num_columns)
+            ax.set_subplotspec(grid[row * lines + column // columns, column % columns])
+    fig.set_size_inches(WIDTH, height * lines)
 
 
 def _say_what_is_shared(panels: list[Axes], old: int, new: int) -> None:
-    """What the first panel of a row, or the last or first of a column, said for the others.
+    """What the first panel of a row, and the outer ones of a column, said for the others.
 
     ``old`` and ``new`` are numbers of columns.
     """
     for place, ax in enumerate(panels):
-        left, top, bottom = (
-            panels[n] for n in (place - place % old, place % old, place % old - old)
-        )
+        column = place % old
+        left, top, bottom = panels[place - column], panels[column], panels[column - old]
         ax.set_title(ax.get_title() or top.get_title(), fontsize=top.title.get_fontsize())
         ax.set_xlabel(ax.get_xlabel() or bottom.get_xlabel())
         ax.set_ylabel(ax.get_ylabel() or left.get_ylabel())
         ax.tick_params(labelbottom=True, labelleft=True)
     for place, ax in enumerate(panels):
-        left = panels[place - place % new]
+        left = panels[place - place % old % new]
         if ax is not left and ax.get_shared_y_axes().joined(ax, left):
             ax.set_ylabel("" if ax.get_ylabel() == left.get_ylabel() else ax.get_ylabel())
             ax.tick_params(labelleft=False)

@@ -29,15 +29,16 @@ def test_panels_that_would_be_squeezed_stand_below_each_other(three):
     assert [ax.get_ylabel() for ax in three.axes] == ["cost"] * 3
 
 
-def test_small_panels_stay_side_by_side_and_the_first_of_a_row_speaks_for_it():
+def test_small_panels_stay_side_by_side_and_each_row_begins_a_line():
     fig, axes = plt.subplots(2, 3, figsize=(8, 5), sharey=True)
     for row, name in zip(axes, ("a", "b"), strict=True):
         row[0].set_ylabel(name)
         row[0].set_title(name)
     make_narrow(fig)
     geometries = {ax.get_subplotspec().get_gridspec().get_geometry() for ax in fig.axes}
-    assert geometries == {(3, 2)}
-    assert [ax.get_ylabel() for ax in fig.axes] == ["a", "", "a", "b", "b", ""]
+    assert geometries == {(4, 2)}
+    assert [ax.get_title() for ax in fig.axes[:3]] == ["a", "", ""]
+    assert [ax.get_ylabel() for ax in fig.axes] == ["a", "", "a", "b", "", "b"]
     plt.close(fig)
 
 

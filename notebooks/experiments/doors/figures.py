@@ -219,10 +219,9 @@ def every_run(
 ) -> Figure:
     """Doors opened by every run, a panel for each friction."""
     fig, axes = plt.subplots(1, len(tested), figsize=(11, 3.8), sharey=True, squeeze=False)
-    short = {arm: name.replace(" ", "\n", 1) for arm, name in NAMES.items()}
     for ax, f in zip(axes[0], tested, strict=True):
         runs = {arm: 100 * rate(success, cell, f).to_numpy() for arm, cell in arms.items()}
-        figures.draw_runs(ax, runs, short)
+        figures.draw_runs(ax, runs, NAMES)
         ax.axhline(100 * by_hand[f], color="0.5", lw=1, ls=":")
         for arm in PUBLISHED:
             method, place = arms[arm].trained.label, list(arms).index(arm) - 0.35
