@@ -31,10 +31,13 @@ def _svg(fig: Figure) -> str:
 
 
 def make_narrow(fig: Figure) -> None:
-    """As many panels in a row as keep their width; what stood in one row takes some lines."""
+    """As many panels in a row as keep their width; what stood in one row takes some lines.
+
+    Panels that are no whole grid stay where they are.
+    """
     width, height = fig.get_size_inches()
     panels = [ax for ax in fig.axes if ax.get_subplotspec() is not None]
-    num_rows, num_columns = panels[0].get_subplotspec().get_gridspec().get_geometry()
+    num_rows, num_columns = _grid(panels)
     fitting = max(1, int(WIDTH / (width / num_columns)))
     lines = math.ceil(num_columns / fitting)
     if lines > 1:
@@ -45,6 +48,17 @@ def make_narrow(fig: Figure) -> None:
             row, column = divmod(place, num_columns)
             ax.set_subplotspec(grid[row * lines + column // columns, column % columns])
     fig.set_size_inches(WIDTH, height * lines)
+
+
+def _grid(panels: list[Axes]) -> tuple[int, int]:
+    """Rows and columns of panels that fill a grid, one in each place."""
+    specs = [ax.get_subplotspec() for ax in panels]
+    shapes = {spec.get_gridspec().get_geometry() for spec in specs}
+    if len(shapes) == 1:
+        [shape] = shapes
+        if [spec.num1 for spec in specs] == list(range(math.prod(shape))):
+            return shape
+    return 1, 1
 
 
 def _say_what_is_shared(panels: list[Axes], old: int, new: int) -> None:

@@ -42,6 +42,16 @@ def test_small_panels_stay_side_by_side_and_each_row_begins_a_line():
     plt.close(fig)
 
 
+def test_panels_that_are_no_grid_stay_where_they_are():
+    fig, axes = plt.subplots(1, 3, figsize=(9, 3))
+    axes[1].remove()
+    make_narrow(fig)
+    assert fig.get_size_inches().tolist() == [WIDTH, 3]
+    plt.close(fig)
+    make_narrow(plt.figure(figsize=(9, 3)))
+    plt.close()
+
+
 def test_the_wide_drawing_brings_the_narrow_one(three):
     svg = both(three)
     [inside] = re.findall(r'<metadata class="narrow">([^<]*)</metadata>', svg)
