@@ -74,10 +74,11 @@ def wall_hours(bench: dict) -> str:
         title: [[cost(part) for part in wave] for wave in recorded(names)]
         for title, names in chapters.items()
     }
+    dearer = {cores: factor if cores > 1 else 1 for cores in CORES}
     lines = [
         {"Cores": str(cores)}
         | {
-            title: f"{wall_seconds(waves, cores) * (factor if cores > 1 else 1) / 3600:.2f}"
+            title: at_least(wall_seconds(waves, cores) * dearer[cores] / 3600, 2)
             for title, waves in costs.items()
         }
         for cores in CORES

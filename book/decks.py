@@ -17,6 +17,8 @@ from playwright.sync_api import sync_playwright
 from chapters import Notebook
 from experiments.orphans import python
 from finish.equations import set_equations
+from finish.minus import set_minus
+from finish.pictures import NARROW
 from messages import BuildError, for_terminal
 from printing import chromium
 
@@ -78,7 +80,7 @@ def build(source: Path, new: Path, html: Path, notebooks: list[Notebook]) -> Non
             filled = Filler(notebook.read_executed(), new).fill(deck)
             (new / f"{notebook.name}.md").write_text(filled, encoding="utf-8")
     run_sphinx(new, html / "slides")
-    set_equations_of(html / "slides")
+    finish_slides(html / "slides")
     print_all(html / "slides", decks)
 
 
@@ -148,7 +150,7 @@ def write_image(outputs: list[NotebookNode], path: Path) -> Path:
     for data in (output.get("data", {}) for output in outputs):
         if "image/svg+xml" in data:
             path = path.with_suffix(".svg")
-            path.write_text(data["image/svg+xml"], encoding="utf-8")
+            path.write_text(NARROW.sub("", data["image/svg+xml"]), encoding="utf-8")
             return path
         if "image/png" in data:
             path = path.with_suffix(".png")
@@ -173,8 +175,8 @@ def run_sphinx(source: Path, target: Path) -> None:
         shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
 
 
-def set_equations_of(folder: Path) -> None:
-    """As on the pages of the book: there is no script for them."""
+def finish_slides(folder: Path) -> None:
+    """Equations and minus signs as on the pages of the book."""
     paths = {path.name: path for path in folder.glob("*.html")}
     pages = {
         name: BeautifulSoup(path.read_text(encoding="utf-8"), "html.parser")
@@ -182,6 +184,7 @@ def set_equations_of(folder: Path) -> None:
     }
     set_equations(pages)
     for name, page in pages.items():
+        set_minus(page)
         paths[name].write_text(str(page), encoding="utf-8")
 
 

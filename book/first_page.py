@@ -5,9 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
+import pandas as pd
+
 import claims
 from experiments import figures
+from experiments.cue import outcomes, training
 from experiments.figures import Advantage
+from experiments.store import Store
 from fragments import write_fragment
 from rules import Cells, NoData
 from rules.verdicts import compare
@@ -18,7 +22,7 @@ PICTURE = "advantages.svg"
 def write_fragments(folder: Path, data: Path = claims.DATA) -> None:
     """Writes ``_generated/finding.md`` and the picture that it shows under ``folder``."""
     book = claims.read_claims(data)
-    text = finding(book, data)
+    text = f"{finding(book, data)} {maze(data)}".rstrip()
     if shown := list(advantages(book, data)):
         picture = folder / "_generated" / PICTURE
         picture.parent.mkdir(parents=True, exist_ok=True)
@@ -42,6 +46,25 @@ def clause(part: dict, book: dict, data: Path) -> str:
     results = claims.read_results({"claims": [decided]}, data)
     verdict = claims.decide(decided, book, results, data).verdict
     return part["says"].get(verdict, f"whether {part['question']}: {verdict}")
+
+
+def maze(data: Path = claims.DATA) -> str:
+    """At how many points of the maze the game helps and harms, of those where theory says so."""
+    stores = [Store(data / "results" / "cue", name) for name in training.PHASES.values()]
+    rows = pd.concat([store.rows() for store in stores])
+    if rows.empty:
+        return ""
+    found = outcomes.differences(outcomes.by_run(rows), outcomes.BASELINES)
+    counts = outcomes.difference_counts(outcomes.with_predictions(found))
+    beside = counts.set_index("IPO against").loc["PPO"]
+    better, worse = (
+        f"{beside[f'… came out {sign}']} of {beside[f'predicted {sign}']}"
+        for sign in ("better", "worse")
+    )
+    return (
+        "In {doc}`a maze where domains disagree <cue>`, IPO does better than PPO in "
+        f"{better} cases where theory foretells it, and worse in {worse}."
+    )
 
 
 def advantages(book: dict, data: Path = claims.DATA) -> Iterator[Advantage]:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 PIN = re.compile(r"([\w.-]+)==([\w.+]+)")
+ADDRESS = re.compile(r"https?://[^\s)]+")
 # Of what pages bring along that neither we nor those packages wrote: where it says so.
 NOTICES = (
     ("pydata-sphinx-theme", "bootstrap.js.LICENSE.txt"),
@@ -22,7 +23,7 @@ def overview() -> str:
     lines += [notice(package, name) for package, name in NOTICES]
     lines += ["", "| Package | Version | Licence |", "|:--|:--|:--|"]
     lines += [f"| {name} | {version} | {licence(name)} |" for name, version in pinned().items()]
-    return "\n".join(lines) + "\n"
+    return ADDRESS.sub(r"<\g<0>>", "\n".join(lines)) + "\n"  # a link may wrap anywhere
 
 
 def mathjax() -> str:

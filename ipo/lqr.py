@@ -171,7 +171,7 @@ def expected_cost(K: Gains, problem: LQR, W: Observation) -> Tensor:
         W: observations ``[R, n_o, n_x]``.
 
     Returns:
-        ``[R]``, differentiable; ``inf`` where the closed loop is unstable: the equation then
+        ``[R]``, differentiable; ``inf`` where the closed loop is unstable, since the equation then
         still has a solution, but a meaningless one.
     """
     return feedback_costs(K @ W, problem)

@@ -11,8 +11,9 @@ from finish.downloads import add_downloads
 from finish.equations import set_equations
 from finish.icons import draw_icons
 from finish.lean import make_lean, remove_source_maps
+from finish.minus import set_minus
 from finish.pictures import adapt_pictures
-from finish.tables import keep_intervals
+from finish.tables import fit_tables
 
 
 def finish(html: Path) -> None:
@@ -24,7 +25,8 @@ def finish(html: Path) -> None:
     for name, page in pages.items():
         make_accessible(page)
         adapt_pictures(page, html)
-        keep_intervals(page)
+        set_minus(page)
+        fit_tables(page)
         add_downloads(page)
         make_lean(name, page)
     write_pages(html, pages)

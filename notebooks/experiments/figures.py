@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import textwrap
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -16,6 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib_inline.config import InlineBackend
 
+from experiments import narrow
 from ipo.causality.scm import SCM
 from ipo.networks import Network
 from ipo.stats import mean_interval
@@ -71,12 +73,11 @@ STYLE = {
 
 
 def set_up() -> None:
-    """The book's style; in a notebook, figures are vectors, which any screen shows sharply."""
+    """The book's style; in a notebook, figures are vectors, for wide screens and for phones."""
     plt.rcParams.update(STYLE)
     if shell := get_ipython():
-        backend = InlineBackend.instance(parent=shell)
-        backend.figure_formats = {"svg"}
-        backend.print_figure_kwargs = {"bbox_inches": "tight", "metadata": {"Date": None}}
+        InlineBackend.instance(parent=shell).figure_formats = {"svg"}
+        shell.display_formatter.formatters["image/svg+xml"].for_type(Figure, narrow.both)
 
 
 def label(method: str) -> str:
@@ -132,7 +133,7 @@ def draw_runs(ax: Axes, values: dict[str, np.ndarray], names: dict[str, str]) ->
         low, high = mean_interval(runs)
         ax.plot([column + 0.3] * 2, [low, high], color="black", lw=2)
         ax.plot(column + 0.3, runs.mean(), color="black", marker="o", ms=5)
-    ax.set_xticks(range(len(values)), [names[arm].replace(", ", ",\n") for arm in values])
+    ax.set_xticks(range(len(values)), [textwrap.fill(names[arm], 13) for arm in values])
     ax.grid(axis="x", visible=False)
 
 
@@ -201,12 +202,13 @@ def draw_outcomes(ax: Axes, outcomes: np.ndarray, values: np.ndarray) -> None:
 
 
 def draw_network(ax: Axes, network: Network) -> None:
-    """The layers of an actor-critic as boxes, with their sizes, and what goes where."""
+    """The layers of an actor-critic as boxes, with their sizes, and what goes where: downwards."""
     nodes, edges = network_graph(network)
+    nodes = {name: (height, -depth) for name, (depth, height) in nodes.items()}
     for start, end in edges:
         ax.annotate(
             "", xy=nodes[end], xytext=nodes[start],
-            arrowprops={"arrowstyle": "->", "shrinkA": 34, "shrinkB": 34, "color": "0.3"},
+            arrowprops={"arrowstyle": "->", "shrinkA": 20, "shrinkB": 20, "color": "0.3"},
         )  # fmt: skip
     for name, (x, y) in nodes.items():
         color = "#D55E00" if "actor" in name else "#0072B2" if "critic" in name else "#009E73"
@@ -216,8 +218,7 @@ def draw_network(ax: Axes, network: Network) -> None:
             x, y, text, ha="center", va="center", fontsize="medium",
             bbox={"boxstyle": "round,pad=0.4", "facecolor": "white", "edgecolor": color, "lw": 1.5},
         )  # fmt: skip
-    columns = [x for x, _ in nodes.values()]
-    ax.set(xlim=(min(columns) - 0.6, max(columns) + 0.6), ylim=(-1.6, 1.6))
+    ax.set(xlim=(-1.6, 1.6), ylim=(min(y for _, y in nodes.values()) - 0.5, 0.5))
     ax.axis("off")
 
 

@@ -65,12 +65,13 @@ def arms(num_domains: int, dim_distractor: int, num_iterations: int) -> list[Cel
     ]
 
 
-def costs(rows: pd.DataFrame, by: str, **fixed: int) -> pd.DataFrame:
-    """Cost in a new domain, mean ± standard deviation over runs, by arm and ``by``."""
+def costs(rows: pd.DataFrame, **fixed: int) -> pd.DataFrame:
+    """Cost in a new domain, mean ± standard deviation over runs, by arm and number of domains."""
     chosen = select(rows, {"metric": "test_cost", "optimizer": "adam", **fixed})
-    table = chosen.groupby(["method", by])["value"].agg(mean_and_std).unstack().reindex(list(ARMS))
-    table = table.fillna("").rename(index=ARMS)
-    return table.rename_axis(index=None, columns=by.replace("_", " "))
+    groups = chosen.groupby(["method", "num_domains"])["value"]
+    table = groups.agg(mean_and_std).unstack().reindex(list(ARMS)).fillna("")
+    table = table.rename(index=ARMS, columns="{} domains".format)
+    return table.rename_axis(index="arm", columns=None).reset_index()
 
 
 def recovered(rows: pd.DataFrame) -> pd.DataFrame:

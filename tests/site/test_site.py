@@ -8,7 +8,7 @@ import zipfile
 from urllib.parse import urldefrag, urlsplit
 
 import pytest
-from browse import PHONE, Visit, new_context, open_page, visit
+from browse import PHONE, WIDE, Visit, new_context, open_page, visit
 
 import archive
 import printing
@@ -141,6 +141,49 @@ def test_every_figure_has_a_number_of_its_own_and_a_caption(visits):
 def test_no_page_scrolls_sideways_on_a_phone(phone_visits):
     widths = {name: seen.content["width"] for name, seen in phone_visits.items()}
     assert {name: width for name, width in widths.items() if width > PHONE["width"]} == {}
+
+
+# Tables that are wider than the box in which they stand, folded ones, too.
+WIDE_TABLES = """() => {
+  document.querySelectorAll('.bd-article details').forEach(fold => { fold.open = true; });
+  const boxes = (e) => e.matches('.bd-article') ? [] : [e, ...boxes(e.parentElement)];
+  return [...document.querySelectorAll('.bd-article table')]
+    .filter(table => boxes(table).some(box => box.scrollWidth > box.clientWidth + 1))
+    .map(table => table.innerText.slice(0, 60));
+}"""
+
+
+@pytest.mark.parametrize("viewport", [WIDE, PHONE], ids=["wide", "phone"])
+def test_no_table_scrolls(browser, built_site, page_names, viewport):
+    with new_context(browser, viewport) as context:
+        page = context.new_page()
+        wide = {}
+        for name in page_names:
+            open_page(page, f"{built_site.as_uri()}/{name}")
+            wide[name] = page.evaluate(WIDE_TABLES)
+    assert {name: tables for name, tables in wide.items() if tables} == {}
+
+
+# Pixels of a phone for each point of a figure's width, by figure.
+SCALES = """async () => {
+  const shown = [...document.querySelectorAll('.picture img')].filter(i => i.checkVisibility());
+  shown.forEach(picture => { picture.loading = 'eager'; });
+  await Promise.all(shown.map(picture => picture.decode()));
+  return shown.map(picture => ({
+    scale: picture.clientWidth / (.75 * picture.naturalWidth), alt: picture.alt.slice(0, 60)}));
+}"""
+SMALL_LETTERS = 9.6  # points
+
+
+def test_letters_of_figures_are_seven_pixels_high_on_a_phone(browser, built_site, page_names):
+    with new_context(browser, PHONE) as context:
+        page = context.new_page()
+        tiny = {}
+        for name in page_names:
+            open_page(page, f"{built_site.as_uri()}/{name}")
+            shown = page.evaluate(SCALES)
+            tiny[name] = [one for one in shown if one["scale"] * SMALL_LETTERS < 7]
+    assert {name: figures for name, figures in tiny.items() if figures} == {}
 
 
 # --- weight -------------------------------------------------------------------------------------

@@ -1,5 +1,6 @@
 """The last steps of the site's pages, on small pieces of HTML."""
 
+import html
 import re
 import zipfile
 
@@ -13,13 +14,14 @@ from finish.access import make_accessible
 from finish.equations import set_equations
 from finish.icons import svg
 from finish.lean import make_lean, remove_source_maps
+from finish.minus import set_minus
 from finish.pictures import adapt_pictures
-from finish.tables import keep_intervals
+from finish.tables import fit_tables
 from messages import BuildError
 
 
-def page(html: str) -> BeautifulSoup:
-    return BeautifulSoup(f"<html><body>{html}</body></html>", "html.parser")
+def page(body: str) -> BeautifulSoup:
+    return BeautifulSoup(f"<html><body>{body}</body></html>", "html.parser")
 
 
 def test_equations_become_pictures_that_screen_readers_can_read():
@@ -65,8 +67,8 @@ def test_names_roles_and_headers_say_what_is_there():
 
 
 def test_only_the_search_loads_what_it_needs(tmp_path):
-    html = '<script src="searchindex.js?v=1"></script><script src="own.js"></script>'
-    pages = {name: page(html) for name in ("search.html", "lqr.html")}
+    scripts = '<script src="searchindex.js?v=1"></script><script src="own.js"></script>'
+    pages = {name: page(scripts) for name in ("search.html", "lqr.html")}
     for name, one in pages.items():
         make_lean(name, one)
     assert [len(one.select("script")) for one in pages.values()] == [2, 1]
@@ -86,17 +88,82 @@ def test_a_figure_gets_a_twin_for_dark_mode(tmp_path):
     light, dark = one.select(".picture img")
     assert (light["src"], dark["src"], dark["alt"]) == ("a.svg", "a.dark.svg", "A")
     assert "only-light" in light["class"] and "only-dark" in dark["class"]
-    assert one.select_one(".picture")["tabindex"] == "0"
     twin = (tmp_path / "a.dark.svg").read_text()
     assert 'fill="#e6e6e6"' in twin and "fill: #121212; stroke: #0072b2" in twin
-    assert len(one.select("img")) == 3
+    assert len(one.select("img")) == 3 and not one.select("source")
+
+
+def test_a_phone_loads_the_narrow_drawing_that_a_wide_one_brings(tmp_path):
+    narrow = "<svg>matplotlib, A &amp; B</svg>"
+    metadata = f'<metadata class="narrow">{html.escape(narrow)}</metadata>'
+    (tmp_path / "_images").mkdir()
+    (tmp_path / "_images" / "a.svg").write_text(f"<svg><g>matplotlib</g>{metadata}</svg>")
+    figure = '<div class="bd-article"><img src="_images/a.svg" alt="A"></div>'
+    pages = [page(figure), page(figure)]
+    for one in pages:  # the second finds what the first has taken out
+        adapt_pictures(one, tmp_path)
+        sources = [source["srcset"] for source in one.select("picture > source[media]")]
+        assert sources == ["_images/a.narrow.svg", "_images/a.narrow.dark.svg"]
+    assert (tmp_path / "_images" / "a.svg").read_text() == "<svg><g>matplotlib</g></svg>"
+    assert (tmp_path / "_images" / "a.narrow.svg").read_text() == narrow
 
 
 def test_cells_wrap_around_intervals_only():
-    one = page('<table class="bd-article"><tr><td>0.75 [0.7, 0.8]</td><td>9 ± 1</td></tr></table>')
-    keep_intervals(page=one)
+    cells = "<tr><td>0.75 [0.7, 0.8]</td><td>9 ± 1</td></tr>"
+    one = page(f'<div class="bd-article"><table>{cells}</table></div>')
+    fit_tables(one)
     assert [whole.get_text() for whole in one.select("td > .interval")] == ["[0.7, 0.8]", "9 ± 1"]
     assert one.td.get_text() == "0.75 [0.7, 0.8]"
+
+
+def table(heads: list[str], *rows: list[str]) -> BeautifulSoup:
+    head, *body = (
+        "<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>" for row in (heads, *rows)
+    )
+    whole = f"<table><thead>{head}</thead><tbody>{''.join(body)}</tbody></table>"
+    return page(f'<div class="bd-article">{whole}</div>')
+
+
+def test_only_a_table_that_is_too_wide_for_a_phone_is_stacked():
+    narrow, wide = (table(["arm", *["12345"] * num], ["IPO", *["0.93"] * num]) for num in (6, 7))
+    for one in (narrow, wide):
+        fit_tables(one)
+    assert not narrow.select(".stacked, [data-label]")
+    assert [cell["data-label"] for cell in wide.select(".stacked tbody td")][:2] == ["arm", "12345"]
+
+
+def test_words_have_a_line_of_their_own_and_empty_cells_no_name():
+    words = "a sentence that is longer than a third of a line"
+    one = table(["what", "incomprehensibilities", "n", "p"], [words, words, "", "incomprehensible"])
+    fit_tables(one)
+    _, long, empty, short = one.select("tbody td")
+    assert long["class"] == ["long"] and "class" not in short.attrs
+    assert "data-label" not in empty.attrs and short["data-label"] == "p"
+
+
+def test_columns_are_counted_from_the_last_where_a_cell_spans_rows():
+    one = table(["method", "of", "a column of numbers that is wide"], ["IPO", "ours", "1 ± 1"])
+    one.tbody.append(BeautifulSoup("<tr><td>paper</td><td>2</td></tr>", "html.parser"))
+    one.tbody.tr.td["rowspan"] = "2"
+    one.tbody.tr.find_all("td")[2].string = "x" * 40
+    fit_tables(one)
+    labels = [[cell["data-label"] for cell in row.select("td")] for row in one.select("tbody tr")]
+    assert labels[1] == labels[0][1:] and labels[1][0] == "of"
+
+
+@pytest.mark.parametrize(
+    ("typed", "shown"),
+    [
+        ("-0.03 [-1, -.5]", "−0.03 [−1, −.5]"),
+        ("-0.00, [-0, 1]", "0.00, [0, 1]"),
+        ("2026-11-27, 5e-4, x^-1, Okabe-Ito, 1-2", "2026-11-27, 5e-4, x^-1, Okabe-Ito, 1-2"),
+    ],
+)
+def test_negative_numbers_have_a_minus_sign(typed, shown):
+    one = page(f"<p>{typed}</p><code>{typed}</code>")
+    set_minus(one)
+    assert one.p.get_text() == shown
+    assert one.code.get_text() == typed
 
 
 def test_the_archive_has_the_sources_and_no_solutions(tmp_path):

@@ -26,14 +26,14 @@ def maze() -> Figure:
     ax.plot(*zip(*walls, walls[0], strict=True), color="0.2", lw=2)
     ax.plot(0, 0.5, marker="^", ms=14, color="#D55E00")
     for x, name in ((-2, "reward\nhere?"), (2, "or\nhere?")):
-        ax.text(x, 2.5, name, ha="center", va="center", fontsize=9)
+        ax.text(x, 2.5, name, ha="center", va="center", fontsize="small")
     for x, arrow, name, color in (
         (-0.6, "→", "landmark", "#009E73"),
         (0.6, "←", "cue", "#CC79A7"),
     ):
-        ax.text(x, 3.05, arrow, ha="center", va="bottom", fontsize=20, color=color)
-        ax.text(x, 3.65, name, ha="center", va="bottom", fontsize=9)
-    ax.text(0.75, 0.5, "start", va="center", fontsize=9)
+        ax.text(x, 3.05, arrow, ha="center", va="bottom", fontsize="xx-large", color=color)
+        ax.text(x, 3.65, name, ha="center", va="bottom", fontsize="small")
+    ax.text(0.75, 0.5, "start", va="center", fontsize="small")
     ax.set(xlim=(-3, 3), ylim=(-0.2, 4.1), aspect="equal")
     ax.axis("off")
     return fig
@@ -53,7 +53,7 @@ def waiting(runs: pd.DataFrame) -> Figure:
     steps = sorted(rows["steps"].unique())
     ax.set_xticks(steps, steps)
     ax.set(xlabel="gradient steps on each rollout", ylabel="return in the worst domain")
-    ax.legend(fontsize=8)
+    ax.legend(fontsize="small")
     return fig
 
 
@@ -70,7 +70,7 @@ def phases(worst: pd.Series, missed: pd.Series, points: Sequence[Cues]) -> Figur
         _mark(ax, points, [cues for cues in points if missed[text(cues), method]])
         if method != "vrex":
             _draw_border(ax, points, method)
-        ax.set_title(name.replace(", ", ",\n"), fontsize=9)
+        ax.set_title(name.replace(", ", ",\n"), fontsize="small")
         ax.set_xlabel("$c_1$")
     axes[0].set_ylabel("$c_2$")
     fig.colorbar(picture, ax=axes, label="return in the worst domain", shrink=0.8)
@@ -84,8 +84,8 @@ def _draw(ax: Axes, points: Sequence[Cues], worst: pd.Series):
     for cues in points:
         values[rows.index(cues[-1]), columns.index(cues[0])] = worst[text(cues)]
     ax.grid(False)
-    ax.set_xticks(range(len(columns)), [f"{c:g}" for c in columns], fontsize=7)
-    ax.set_yticks(range(len(rows)), [f"{c:g}".replace("-", "−") for c in rows], fontsize=7)
+    ax.set_xticks(range(len(columns)), [f"{c:g}" for c in columns], fontsize="small")
+    ax.set_yticks(range(len(rows)), [f"{c:g}".replace("-", "−") for c in rows], fontsize="small")
     return ax.imshow(values, cmap="cividis", vmin=0, vmax=LANDMARK, origin="lower", aspect="auto")
 
 

@@ -19,6 +19,7 @@ NAMES = {
     "ipo": "IPO",
     "vrex": "V-REx",
 }
+BASELINES = ("ppo", "in_turn", "ensemble")  # that IPO is compared with
 MARGIN = 0.1  # a difference of returns that counts
 HALF = LANDMARK / 2  # between the returns of following landmark and cue where the cue is wrong
 INFORMED = (0.5 + LANDMARK) / 2  # between chance and the landmark, where the cue says nothing

@@ -173,7 +173,8 @@ def short_varied(cell: Varied) -> Varied | None:
     return replace(cell, settings=replace(cell.settings, num_updates=1))
 
 
+PHASES = {2: "two_domains", 3: "three_domains", 4: "four_domains"}  # by numbers of domains
 EXPERIMENTS = {
     name: Experiment(run_cell, Cell, short)
-    for name in ("two_domains", "three_domains", "four_domains", "encodings", "many_steps")
+    for name in (*PHASES.values(), "encodings", "many_steps")
 } | {"varied": Experiment(run_cell, Varied, short_varied)}

@@ -219,17 +219,16 @@ def every_run(
 ) -> Figure:
     """Doors opened by every run, a panel for each friction."""
     fig, axes = plt.subplots(1, len(tested), figsize=(11, 3.8), sharey=True, squeeze=False)
-    short = {arm: name.replace(" ", "\n", 1) for arm, name in NAMES.items()}
     for ax, f in zip(axes[0], tested, strict=True):
         runs = {arm: 100 * rate(success, cell, f).to_numpy() for arm, cell in arms.items()}
-        figures.draw_runs(ax, runs, short)
+        figures.draw_runs(ax, runs, NAMES)
         ax.axhline(100 * by_hand[f], color="0.5", lw=1, ls=":")
         for arm in PUBLISHED:
             method, place = arms[arm].trained.label, list(arms).index(arm) - 0.35
             point = paper[(paper["method"] == method) & (paper["domain"] == str(f))]
             ax.scatter(place, 100 * point["mean"], s=60, facecolors="none", edgecolors="0.35")
         ax.set_title(f"friction {f}", fontsize="medium")
-        ax.tick_params(axis="x", labelsize=7, rotation=90)
+        ax.tick_params(axis="x", labelsize="small", rotation=90)
     axes[0, 0].set_ylabel("doors opened [%]")
     return fig
 

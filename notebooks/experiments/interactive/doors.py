@@ -105,5 +105,5 @@ def picture(data: Mapping[str, Any]) -> Figure:
     ax.axvline(hardest / data["gear"], color="black", ls="--", lw=1)
     ax.set_yticks([0, 1], ["not opened", "opened"])
     ax.set(xlabel="lever arm [m]", title=f"run 0, friction {hardest}", ylim=(-0.3, 1.5))
-    ax.legend(loc="upper left", ncols=2, fontsize=8)
+    ax.legend(loc="upper left", ncols=2, fontsize="small")
     return fig
