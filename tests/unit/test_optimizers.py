@@ -99,6 +99,18 @@ def test_run_without_a_gradient_spoils_only_itself(name, max_gradient_norm):
     assert_close(weights[1:].detach(), healthy.detach(), rtol=1e-14)
 
 
+@pytest.mark.parametrize("name", ["adam", "plain"])
+def test_a_run_whose_cost_is_infinite_stays_where_it_is(name):
+    """1 / w is infinite at 0, and so is its slope; the other run goes on as if it were alone."""
+    weights, alone = leaf([[0.0], [2.0]]), leaf([[2.0]])
+    for w in (weights, alone):
+        optimizer = make_optimizer(name, [w], 0.1)
+        for _ in range(3):
+            descend(optimizer, lambda w=w: 1 / w.sum(1))
+    assert weights[0].tolist() == [0.0]
+    assert torch.equal(weights[1:], alone) and float(alone.detach()) > 2
+
+
 def test_gradients_are_clipped_run_by_run():
     """Gradients (3, 4), (0.3, 0.4) and 0 of norms 5, 0.5 and 0: only the first is above 1."""
     weights = leaf([[0.0, 0.0]] * 3)
