@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from experiments import figures
-from experiments.experiment import Experiment
+from experiments.experiment import Experiment, a_fiftieth_earlier
 from experiments.rows import tidy
 from experiments.store import select
 from ipo.causality.icp import icp
@@ -348,16 +348,8 @@ def short(cell: Cell) -> Cell | None:
     return replace(cell, settings=replace(cell.settings, num_iterations=30))
 
 
-def earlier(cell: Cell) -> Cell | None:
-    """Without the last fiftieth of the iterations; players with a constant rate keep moving."""
-    if cell.settings is None:
-        return None
-    num_iterations = cell.settings.num_iterations * 49 // 50
-    return replace(cell, settings=replace(cell.settings, num_iterations=num_iterations))
-
-
 EXPERIMENTS = {
-    name: Experiment(run_cell, Cell, short, earlier=earlier)
+    name: Experiment(run_cell, Cell, short, earlier=a_fiftieth_earlier)
     for name in ("linear", "digits", "failures")
 }
 
