@@ -91,14 +91,24 @@ class Cell:
         return {"method": self.label, "train_frictions": "+".join(map(str, TRAIN_FRICTIONS))}
 
 
+PUBLISHED_UPDATES = 95  # after which the published training of IPO ended
+
+
+def control(label: str, method: str, learning_rate: float) -> Cell:
+    """An arm that shows what a difference is due to; it ends where IPO's published training did."""
+    changes = {"learning_rate": learning_rate, "num_updates": PUBLISHED_UPDATES}
+    return Cell(label, published_door(method, **changes), saved_after=(PUBLISHED_UPDATES,))
+
+
+CONTROLS = {
+    "ensemble": control("ensemble", "ensemble", 5e-4),
+    "in_turn": control("in_turn", "in_turn", 5e-4),
+    "ipo_lr1e-3": control("ipo_lr1e-3", "ipo", 1e-3),
+}
 CELLS = {
-    cell.label: cell
-    for cell in (
-        Cell("ppo", published_door("ppo")),
-        Cell("ipo", published_door("ipo")),
-        Cell("ipo_lr1e-3", published_door("ipo", learning_rate=1e-3)),
-        Cell("ensemble", published_door("ensemble", learning_rate=5e-4)),
-    )
+    "ppo": Cell("ppo", published_door("ppo")),
+    "ipo": Cell("ipo", published_door("ipo")),
+    **CONTROLS,
 }
 
 
