@@ -189,9 +189,7 @@ class Store:
                 raise ResultsError(
                     f"{self.csv}: column {absent[0]!r} is missing; needs {list(types)}"
                 )
-            rows = pd.read_csv(
-                io.BytesIO(csv), dtype=types, keep_default_na=False, float_precision="round_trip"
-            )
+            rows = pd.read_csv(io.BytesIO(csv), dtype=types, keep_default_na=False)
         except ResultsError:
             raise
         except ValueError as error:

@@ -49,6 +49,33 @@ CONTENT = """async () => {
     width: document.documentElement.scrollWidth,
   };
 }"""
+# Displayed equations that a narrow screen shrinks below two thirds.
+SHRUNK = """() => [...document.querySelectorAll('.bd-article mjx-container[display] > svg')]
+  .filter(svg => svg.checkVisibility())
+  .map(svg => {
+    const inEx = parseFloat(svg.getAttribute('width'));
+    const probe = svg.cloneNode();
+    Object.assign(probe.style, {width: '1ex', height: '1ex', position: 'absolute'});
+    svg.parentNode.append(probe);
+    const natural = inEx * probe.getBoundingClientRect().width;
+    probe.remove();
+    const scale = svg.getBoundingClientRect().width / natural;
+    return {scale, tex: svg.parentNode.innerText.slice(0, 60)};
+  })
+  .filter(equation => equation.scale < 0.66)"""
+# Pixels for each point of a figure's width, by figure; all have been loaded.
+SCALES = """() => [...document.querySelectorAll('.picture img')]
+  .filter(picture => picture.checkVisibility())
+  .map(picture => ({
+    scale: picture.clientWidth / (.75 * picture.naturalWidth), alt: picture.alt.slice(0, 60)}))"""
+# Tables that are wider than the box in which they stand, folded ones, too: opens all folds.
+WIDE_TABLES = """() => {
+  document.querySelectorAll('.bd-article details').forEach(fold => { fold.open = true; });
+  const boxes = (e) => e.matches('.bd-article') ? [] : [e, ...boxes(e.parentElement)];
+  return [...document.querySelectorAll('.bd-article table')]
+    .filter(table => boxes(table).some(box => box.scrollWidth > box.clientWidth + 1))
+    .map(table => table.innerText.slice(0, 60));
+}"""
 
 
 @dataclass
@@ -87,7 +114,11 @@ def visit(context: BrowserContext, url: str) -> Visit:
     page.on("pageerror", lambda error: seen.errors.append(str(error)))
     page.on("console", lambda message: note_console(seen, message))
     open_page(page, url)
-    seen.content = page.evaluate(CONTENT)
+    seen.content = page.evaluate(CONTENT) | {
+        "shrunk": page.evaluate(SHRUNK),
+        "scales": page.evaluate(SCALES),
+        "wide_tables": page.evaluate(WIDE_TABLES),
+    }
     page.close()
     return seen
 

@@ -16,20 +16,6 @@ FINDINGS = """async () => {
 }"""
 OPEN = "document.querySelectorAll('.bd-article details').forEach(fold => { fold.open = true; })"
 FOLDED = "document.querySelectorAll('.bd-article details').length"
-# Displayed equations that a narrow screen shrinks below two thirds.
-SHRUNK = """() => [...document.querySelectorAll('.bd-article mjx-container[display] > svg')]
-  .filter(svg => svg.checkVisibility())
-  .map(svg => {
-    const inEx = parseFloat(svg.getAttribute('width'));
-    const probe = svg.cloneNode();
-    Object.assign(probe.style, {width: '1ex', height: '1ex', position: 'absolute'});
-    svg.parentNode.append(probe);
-    const natural = inEx * probe.getBoundingClientRect().width;
-    probe.remove();
-    const scale = svg.getBoundingClientRect().width / natural;
-    return {scale, tex: svg.parentNode.innerText.slice(0, 60)};
-  })
-  .filter(equation => equation.scale < 0.66)"""
 # Whatever reaches beyond the text on a sheet of paper is cut.
 CUT = """() => {
   const paper = document.querySelector('.bd-article').getBoundingClientRect().right + 1;
@@ -101,16 +87,6 @@ def test_the_first_screen_has_the_finding_a_picture_and_three_paths(browser, bui
         for part in parts:
             box = page.locator(part).first.bounding_box()
             assert box["y"] + box["height"] <= viewport["height"], part
-
-
-def test_no_equation_is_tiny_on_a_phone(browser, built_site, page_names):
-    with new_context(browser, PHONE) as context:
-        page = context.new_page()
-        tiny = {}
-        for name in page_names:
-            open_page(page, f"{built_site.as_uri()}/{name}")
-            tiny[name] = page.evaluate(SHRUNK)
-    assert {name: equations for name, equations in tiny.items() if equations} == {}
 
 
 def test_paper_cuts_nothing(browser, built_site, page_names):

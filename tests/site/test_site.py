@@ -8,7 +8,7 @@ import zipfile
 from urllib.parse import urldefrag, urlsplit
 
 import pytest
-from browse import PHONE, WIDE, Visit, new_context, open_page, visit
+from browse import PHONE, Visit, new_context, open_page, visit
 
 import archive
 import printing
@@ -143,46 +143,32 @@ def test_no_page_scrolls_sideways_on_a_phone(phone_visits):
     assert {name: width for name, width in widths.items() if width > PHONE["width"]} == {}
 
 
-# Tables that are wider than the box in which they stand, folded ones, too.
-WIDE_TABLES = """() => {
-  document.querySelectorAll('.bd-article details').forEach(fold => { fold.open = true; });
-  const boxes = (e) => e.matches('.bd-article') ? [] : [e, ...boxes(e.parentElement)];
-  return [...document.querySelectorAll('.bd-article table')]
-    .filter(table => boxes(table).some(box => box.scrollWidth > box.clientWidth + 1))
-    .map(table => table.innerText.slice(0, 60));
-}"""
+def test_no_equation_is_tiny_on_a_phone(phone_visits):
+    found = {name: seen.content["shrunk"] for name, seen in phone_visits.items()}
+    assert {name: equations for name, equations in found.items() if equations} == {}
 
 
-@pytest.mark.parametrize("viewport", [WIDE, PHONE], ids=["wide", "phone"])
-def test_no_table_scrolls(browser, built_site, page_names, viewport):
-    with new_context(browser, viewport) as context:
-        page = context.new_page()
-        wide = {}
-        for name in page_names:
-            open_page(page, f"{built_site.as_uri()}/{name}")
-            wide[name] = page.evaluate(WIDE_TABLES)
-    assert {name: tables for name, tables in wide.items() if tables} == {}
+def wide_tables(visits: dict[str, Visit]) -> dict[str, list[str]]:
+    found = {name: seen.content["wide_tables"] for name, seen in visits.items()}
+    return {name: tables for name, tables in found.items() if tables}
 
 
-# Pixels of a phone for each point of a figure's width, by figure.
-SCALES = """async () => {
-  const shown = [...document.querySelectorAll('.picture img')].filter(i => i.checkVisibility());
-  shown.forEach(picture => { picture.loading = 'eager'; });
-  await Promise.all(shown.map(picture => picture.decode()));
-  return shown.map(picture => ({
-    scale: picture.clientWidth / (.75 * picture.naturalWidth), alt: picture.alt.slice(0, 60)}));
-}"""
+def test_no_table_scrolls(visits):
+    assert wide_tables(visits) == {}
+
+
+def test_no_table_scrolls_on_a_phone(phone_visits):
+    assert wide_tables(phone_visits) == {}
+
+
 SMALL_LETTERS = 9.6  # points
 
 
-def test_letters_of_figures_are_seven_pixels_high_on_a_phone(browser, built_site, page_names):
-    with new_context(browser, PHONE) as context:
-        page = context.new_page()
-        tiny = {}
-        for name in page_names:
-            open_page(page, f"{built_site.as_uri()}/{name}")
-            shown = page.evaluate(SCALES)
-            tiny[name] = [one for one in shown if one["scale"] * SMALL_LETTERS < 7]
+def test_letters_of_figures_are_seven_pixels_high_on_a_phone(phone_visits):
+    tiny = {
+        name: [one for one in seen.content["scales"] if one["scale"] * SMALL_LETTERS < 7]
+        for name, seen in phone_visits.items()
+    }
     assert {name: figures for name, figures in tiny.items() if figures} == {}
 
 
