@@ -8,6 +8,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 PIN = re.compile(r"([\w.-]+)==([\w.+]+)")
+NEEDED = "# What the packages above need"
 ADDRESS = re.compile(r"https?://[^\s)]+")
 # Of what pages bring along that neither we nor those packages wrote: where it says so.
 NOTICES = (
@@ -21,8 +22,9 @@ NOTICES = (
 def overview() -> str:
     lines = ["| In the pages | Comes with | Licence |", "|:--|:--|:--|", mathjax()]
     lines += [notice(package, name) for package, name in NOTICES]
-    lines += ["", "| Package | Version | Licence |", "|:--|:--|:--|"]
-    lines += [f"| {name} | {version} | {licence(name)} |" for name, version in pinned().items()]
+    chosen, needed = pinned()
+    lines += ["", *table(chosen), "", f":::{{dropdown}} What they need: {len(needed)} more"]
+    lines += ["", *table(needed), "", ":::"]
     return ADDRESS.sub(r"<\g<0>>", "\n".join(lines)) + "\n"  # a link may wrap anywhere
 
 
@@ -43,9 +45,20 @@ def notice(package: str, name: str) -> str:
     return f"| {title} | {package} | {terms} |"
 
 
-def pinned() -> dict[str, str]:
-    """The packages of ``environment.txt`` and their versions."""
+def table(pins: dict[str, str]) -> list[str]:
+    rows = [f"| {name} | {version} | {licence(name)} |" for name, version in pins.items()]
+    return ["| Package | Version | Licence |", "|:--|:--|:--|", *rows]
+
+
+def pinned() -> tuple[dict[str, str], dict[str, str]]:
+    """The packages of ``environment.txt`` and their versions: our own choice, what they need."""
     text = (ROOT / "environment.txt").read_text(encoding="utf-8")
+    chosen, needed = text.split(NEEDED)
+    return pins(chosen), pins(needed)
+
+
+def pins(text: str) -> dict[str, str]:
+    """By name, in the order of the alphabet."""
     found = [match.groups() for line in text.splitlines() if (match := PIN.match(line))]
     return dict(sorted(found, key=lambda pin: pin[0].lower()))
 

@@ -28,8 +28,13 @@ def locked(name: str) -> dict[str, str]:
     return versions
 
 
+def pins() -> dict[str, str]:
+    chosen, needed = licences.pinned()
+    return chosen | needed
+
+
 def test_locks_have_what_is_pinned():
-    pinned = {normal(name): version for name, version in licences.pinned().items()}
+    pinned = {normal(name): version for name, version in pins().items()}
     assert len(pinned) > 150
     packages, torch = locked("packages.txt"), locked("torch.txt")
     assert {name: (packages | torch).get(name) for name in pinned} == pinned
@@ -42,7 +47,7 @@ def test_locks_have_what_is_pinned():
 
 
 def test_what_is_locked_and_not_pinned_is_for_other_systems():
-    pinned = {normal(name) for name in licences.pinned()}
+    pinned = {normal(name) for name in pins()}
     lines = (LOCKS / "packages.txt").read_text().splitlines()
     found = [match.groups() for line in lines if (match := LOCKED.match(line))]
     assert {name for name, _, marker in found if not marker} <= pinned
@@ -54,10 +59,13 @@ def test_locks_name_no_place_to_fetch_from(path):
 
 
 def test_every_package_names_its_licence():
-    found = {name: licences.licence(name) for name in licences.pinned()}
+    found = {name: licences.licence(name) for name in pins()}
     assert all(re.search(r"\w", licence) for licence in found.values())
     table = licences.overview()
     assert all(text in table for text in ("| numpy |", "MathJax 3", "Font Awesome", "SIL OFL"))
+    chosen, folded = table.split(":::{dropdown}")
+    assert "| torch |" in chosen
+    assert "| alabaster |" in folded
 
 
 def test_package_without_a_licence_is_an_error(monkeypatch):
