@@ -27,8 +27,8 @@ NUM_UPDATES, NUM_UPDATES_FIRST, NUM_RUNS = 60, 25, 30
 POINT = (0.9, -0.3)  # where steps and frames are varied
 ASKED = {
     "two_domains": training.phase_cells(theory.points(2, theory.STRONGER), NUM_UPDATES),
-    "three_domains": training.phase_cells(theory.contested(3, theory.COARSE), NUM_UPDATES),
-    "four_domains": training.phase_cells(theory.contested(4, theory.COARSE), NUM_UPDATES),
+    "three_domains": training.phase_cells(theory.points(3, theory.COARSE), NUM_UPDATES),
+    "four_domains": training.phase_cells(theory.points(4, theory.COARSE), NUM_UPDATES),
     "encodings": training.encoding_cells([POINT, (0.9, -0.9)], NUM_UPDATES),
     "many_steps": training.many_step_cells(theory.contested(2, theory.STRONGER), NUM_UPDATES_FIRST),
     "varied": training.varied_cells(POINT, NUM_UPDATES),

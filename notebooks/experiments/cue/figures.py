@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -57,23 +57,25 @@ def waiting(runs: pd.DataFrame) -> Figure:
     return fig
 
 
-def phases(worst: pd.Series, missed: pd.Series, points: Sequence[Cues]) -> Figure:
-    """Mean return in the worst domain at points of two domains, a map for each method.
+def phases(worst: pd.Series, missed: pd.Series, points: Mapping[int, Sequence[Cues]]) -> Figure:
+    """Mean return in the worst domain, a map for each number of domains and each method.
 
     Args:
         worst: by ``cues, method``.
         missed: by the same, whether something else was predicted; a cross stands there.
+        points: of the diagram of each number of domains.
     """
-    fig, axes = plt.subplots(1, len(NAMES), figsize=(11, 2.9))
-    for ax, (method, name) in zip(axes, NAMES.items(), strict=True):
-        picture = _draw(ax, points, worst.xs(method, level="method"))
-        _mark(ax, points, [cues for cues in points if missed[text(cues), method]])
-        if method != "vrex":
-            _draw_border(ax, points, method)
-        ax.set_title(name.replace(", ", ",\n"), fontsize="small")
-        ax.set_xlabel("$c_1$")
-    axes[0].set_ylabel("$c_2$")
-    fig.colorbar(picture, ax=axes, label="return in the worst domain", shrink=0.8)
+    fig, axes = plt.subplots(len(points), len(NAMES), figsize=(11, 2.6 * len(points)))
+    for row, (num, own) in zip(np.atleast_2d(axes), points.items(), strict=True):
+        for ax, (method, name) in zip(row, NAMES.items(), strict=True):
+            picture = _draw(ax, own, worst.xs(method, level="method"))
+            _mark(ax, own, [cues for cues in own if missed[text(cues), method]])
+            if method != "vrex":
+                _draw_border(ax, own, method)
+            ax.set_title(f"{num}: {name}".replace(", ", ",\n"), fontsize="small")
+            ax.set_xlabel(" = ".join(f"$c_{d}$" for d in range(1, max(num, 2))))
+        row[0].set_ylabel(f"$c_{num}$")
+    fig.colorbar(picture, ax=axes, label="return in the worst domain", shrink=0.8 / len(points))
     return fig
 
 
@@ -103,9 +105,15 @@ def _ranks(points: Sequence[Cues]) -> tuple[list[float], list[float]]:
 def _draw_border(ax: Axes, points: Sequence[Cues], method: str) -> None:
     """Where the rule of a method changes its mind, as far as it is in the diagram."""
     columns, rows = _ranks(points)
+    num = len(points[0])
     first = np.linspace(columns[0], columns[-1], 500)
-    second = STRENGTH**2 / first if method == "ipo" else 2 * STRENGTH - first
-    inside = (second >= rows[0]) & (second <= first)
+    if method == "ipo" and num > 2:  # the majority decides, whatever the last cue is
+        first, second = np.full(2, STRENGTH), np.array([rows[0], rows[-1]])
+    elif method == "ipo":
+        second = STRENGTH**2 / first
+    else:
+        second = num * STRENGTH - (num - 1) * first
+    inside = (second >= rows[0]) & (second <= (first if num == 2 else rows[-1]))
     places = (
         np.interp(values[inside], ranks, range(len(ranks)))
         for values, ranks in ((first, columns), (second, rows))
