@@ -162,6 +162,18 @@ def mean_by_method(runs: pd.DataFrame) -> pd.DataFrame:
     return mean.rename(columns=NAMES).reset_index()
 
 
+def point(line: pd.Series) -> dict[str, object]:
+    """What is told of one comparison: its cues, their mean, and the difference; nothing of none."""
+    if line.empty:
+        return {"cues": "none", "cue": np.nan, "mean": np.nan, "interval": "none"}
+    return {
+        "cues": line["cues"].replace(" ", ", "),
+        "cue": np.mean([float(c) for c in line["cues"].split()]),
+        "mean": line["mean"],
+        "interval": f"[{line['low']:+.2f}, {line['high']:+.2f}]",
+    }
+
+
 def notable(found: pd.DataFrame, shown: Sequence[str]) -> pd.DataFrame:
     """The lines in which IPO was predicted, or found, to differ, with some columns of means."""
     own = found[(found[["predicted", "verdict"]] != "alike").any(axis=1)]
