@@ -26,7 +26,16 @@ def overview() -> str:
                     full(chapter, name, batches),
                 ]
                 lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines) + "\n"
+    return "\n".join([*lines, "", *different()]) + "\n"
+
+
+def different() -> list[str]:
+    """A line for every cell that came out otherwise, and by how much at most."""
+    return [
+        f"- `{cell}` differs: {outcome['apart']}."
+        for cell, outcome in confirmed().items()
+        if outcome["how"] == "differs"
+    ]
 
 
 def slices(chapter: str, name: str) -> str:

@@ -153,13 +153,39 @@ def unsettled(both: pd.DataFrame, before: pd.DataFrame) -> bool:
     return all(near) and min(p, default=1.0) > LEVEL / len(groups)
 
 
+def elsewhere(part: Slice, rows: pd.DataFrame) -> pd.DataFrame | None:
+    """The record and ``rows`` in those domains and metrics where some run is not close to it."""
+    both = side_by_side(Store(DATA / "results" / part.chapter, part.name).rows_of(part.batch), rows)
+    if both is None:
+        return None
+    away = ~within(both, f"{part.chapter}/{part.name}", LONGER)
+    return both[away.groupby([both["domain"], both["metric"]]).transform("any")]
+
+
+def how_far(both: pd.DataFrame | None) -> str:
+    """By how much rows are away from the record: on average, where they are not close."""
+    if both is None:
+        return "other rows"
+    both = both.assign(apart=(both["value_now"] - both["value"]).abs())
+    means = both.groupby(["domain", "metric"])[["apart", "value"]].mean()
+    return ", ".join(
+        f"{metric} in {domain} by {apart:.2g} of {size:.4g}"
+        for (domain, metric), apart, size in means.itertuples()
+    )
+
+
 def _outcome(part: Slice, scratch: Path) -> tuple[str, dict[str, Any]]:
     rows = part.run(scratch)
-    how = compared(part, rows)
-    if how == "differs" and _is_unsettled(part, rows, scratch):
-        how = "unsettled"
+    how, apart = compared(part, rows), {}
+    if how == "differs":
+        away = elsewhere(part, rows)
+        if away is not None and _is_unsettled(part, away, scratch):
+            how = "unsettled"
+        else:
+            apart = {"apart": how_far(away)}
     return title(part), {
         "how": how,
+        **apart,
         "runs": len(part.batch["seeds"]),
         "commit": origin.commit(),
         "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
@@ -168,10 +194,9 @@ def _outcome(part: Slice, scratch: Path) -> tuple[str, dict[str, Any]]:
     }
 
 
-def _is_unsettled(part: Slice, rows: pd.DataFrame, scratch: Path) -> bool:
-    recorded = Store(DATA / "results" / part.chapter, part.name).rows_of(part.batch)
-    both, before = side_by_side(recorded, rows), part.run_earlier(scratch)
-    return both is not None and before is not None and unsettled(both, before)
+def _is_unsettled(part: Slice, away: pd.DataFrame, scratch: Path) -> bool:
+    before = part.run_earlier(scratch)
+    return before is not None and unsettled(away, before)
 
 
 def _is_done(done: dict[str, dict[str, Any]], name: str, since: str | None) -> bool:

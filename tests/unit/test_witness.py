@@ -90,6 +90,8 @@ def test_full_batches_are_confirmed_once(toy, monkeypatch, shift, how):
     monkeypatch.setitem(SHIFT, "cost", shift)
     outcomes = [confirm._outcome(part, toy) for part in confirm.full_batches(["lqr"])]
     assert [outcome["how"] for _, outcome in outcomes] == [how] * 3
+    apart = {outcome.get("apart", "").split(" of ")[0] for _, outcome in outcomes}
+    assert apart == ({"cost in test by 1"} if how == "differs" else {""})
     for cell, outcome in outcomes:
         confirm._save(cell, outcome)
     titles = map(confirm.title, confirm.full_batches(["lqr"]))

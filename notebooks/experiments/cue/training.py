@@ -161,7 +161,8 @@ def exact(network: DenseOnTable, players: Sequence[Weights]) -> dict[tuple[str, 
 
 def short(cell: Cell) -> Cell | None:
     """Two updates, where the last domain's cue is strong and opposite: others are no other kind."""
-    if cell.cues[-1] not in (-0.3, -0.9):
+    first, last = cell.cues[0], cell.cues[-1]
+    if last not in (-0.3, -0.9) or (len(cell.cues) > 2 and first != 0.6):
         return None
     return replace(cell, settings=replace(cell.settings, num_updates=2))
 
