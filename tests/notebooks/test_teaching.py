@@ -14,6 +14,12 @@ from messages import BuildError
 
 ROOT = Path(__file__).resolve().parents[2]
 CHAPTERS = sorted((ROOT / "notebooks").glob("*.ipynb"))
+# Headings with nothing behind them to ask about: what ends a chapter, and what only repeats rows.
+UNASKED = {
+    *("In five sentences", "What would change our mind", "Further reading"),
+    *("Run time and provenance", "Exercises"),
+    *("The same, live", "The same runs, live", "Every configuration, by hand"),
+}
 
 
 @pytest.fixture(params=CHAPTERS, ids=lambda path: path.stem)
@@ -53,6 +59,34 @@ def test_questions_have_one_right_answer_and_a_reason_for_each(chapter):
         assert len(answers) == question.count("{dropdown}") >= 3
         assert [answer["kind"] for answer in answers].count("right") == 1
         assert all(answer["why"] for answer in answers)
+
+
+def test_every_section_ends_with_a_question(chapter):
+    assert set(unasked(chapter)) <= UNASKED
+
+
+def test_parts_after_the_last_question_of_a_section_are_unasked():
+    texts = ["# Title", "## A\n\n### B", "?", "### C", "## D\n\n### E", "## F", "?"]
+    cells = [
+        nbformat.v4.new_markdown_cell(text, id=f"check-{place}" if text == "?" else str(place))
+        for place, text in enumerate(texts)
+    ]
+    assert unasked(nbformat.v4.new_notebook(cells=cells)) == ["C", "D", "E"]
+
+
+def unasked(chapter) -> list[str]:
+    """Headings of sections, and of parts, that no question follows in the same section."""
+    found, waiting = [], []
+    for cell in chapter.cells:
+        if cell.id.startswith("check-"):
+            waiting = []
+        elif cell.cell_type == "markdown":
+            for level, heading in re.findall(r"^(##+) (.*)$", cell.source, re.MULTILINE):
+                if level == "##":
+                    found += waiting
+                    waiting = []
+                waiting.append(heading)
+    return found + waiting
 
 
 def test_right_answers_have_no_favourite_place():
