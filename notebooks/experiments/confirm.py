@@ -46,7 +46,7 @@ CHAOTIC = (
     *("keys/main", "keys/turns", "keys/variants", "keys/larger", "keys/curves"),
     *("keys/in_full", "keys/regularized", "keys/fair", "keys/labels", "algorithm/players"),
     *("door/curves", "door/gaps"),
-    "causality/digits",  # where a game of networks goes round, and some runs stop elsewhere on the way
+    "causality/digits",  # a game of networks goes round there, and runs stop anywhere on the way
     *("cue/many_steps", "cue/varied", "cue/encodings"),
     *("cue/two_domains", "cue/three_domains", "cue/four_domains"),
 )
