@@ -114,6 +114,7 @@ def _draw_border(ax: Axes, points: Sequence[Cues], method: str) -> None:
     else:
         second = num * STRENGTH - (num - 1) * first
     inside = (second >= rows[0]) & (second <= (first if num == 2 else rows[-1]))
+    inside &= (first >= columns[0]) & (first <= columns[-1])
     places = (
         np.interp(values[inside], ranks, range(len(ranks)))
         for values, ranks in ((first, columns), (second, rows))
