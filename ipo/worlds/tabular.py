@@ -249,12 +249,10 @@ def values(task: TabularTask, policy: Policies) -> tuple[np.ndarray, np.ndarray]
     chosen = policy[:, task.observation].transpose(2, 1, 0)  # [A, S, P]
     scores = (chosen * task.goal.T[..., None]).sum(0)
     goes_on = np.tile(chosen * ~task.done.T[..., None], 2)  # for return and success side by side
-    value = np.zeros_like(goes_on[0])
+    value, later = np.zeros_like(goes_on[0]), task.next_state.T
     for reward in task.goal_reward[::-1]:
-        earlier = np.concatenate([reward * scores, scores], axis=1)
-        for probability, next_state in zip(goes_on, task.next_state.T, strict=True):
-            earlier += probability * value[next_state]
-        value = earlier
+        now = np.concatenate([reward * scores, scores], axis=1)
+        value = now + np.einsum("asp,asp->sp", goes_on, value[later])
     returns, success = np.split(value, 2, axis=1)
     return returns, success
 

@@ -142,14 +142,15 @@ def unsettled(both: pd.DataFrame, before: pd.DataFrame) -> bool:
 
     Of each metric and domain runs are on average at most UNREST times as far from what is shipped
     as from what they were ``before`` the end, and by a paired t-test they are to neither side of
-    it. So it is never true of a training that is at rest.
+    it; a single run has no side. So it is never true of a training that is at rest.
     """
-    keys = [column for column in before.columns if column != "value"]
+    keys = [column for column in before.columns if column not in ("value", "round")]
     three = both.merge(before.rename(columns={"value": "value_before"}), on=keys)
     three["apart"] = three["value_now"] - three["value"]
     three["moved"] = three["value_now"] - three["value_before"]
     groups = [own for _, own in three.groupby(["domain", "metric"])]
-    p = [scipy.stats.ttest_1samp(own["apart"], 0).pvalue for own in groups if own["apart"].any()]
+    sided = [own["apart"] for own in groups if own["apart"].any() and len(own) > 1]
+    p = [scipy.stats.ttest_1samp(apart, 0).pvalue for apart in sided]
     near = [own["apart"].abs().mean() <= UNREST * own["moved"].abs().mean() for own in groups]
     return all(near) and min(p, default=1.0) > LEVEL / len(groups)
 

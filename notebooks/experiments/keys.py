@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -33,6 +34,7 @@ from ipo.worlds.colored_keys import COLORS, ColoredKeysEnv
 from ipo.worlds.networks import GridNetwork, OnTable
 from ipo.worlds.tabular import (
     TabularDomains,
+    TabularEnvironments,
     TabularTask,
     expected_return,
     optimal_policy,
@@ -298,6 +300,15 @@ def curve(
     return pd.concat(parts, ignore_index=True)
 
 
+@functools.lru_cache(maxsize=2)
+def in_all_colors(tables: str | Path, size: int) -> tuple[dict[str, TabularTask], TabularDomains]:
+    """The task in each colour, and in all; a process reads the files once, not for each cell."""
+    tasks = {
+        color: load_or_tabulate(ColoredKeysEnv, tables, size=size, color=color) for color in COLORS
+    }
+    return tasks, TabularDomains(list(tasks.values()))
+
+
 class Keys:
     """The tabulated task in all colours, for one encoding of colours, one size and width."""
 
@@ -309,11 +320,8 @@ class Keys:
         width: float = 1.0,
     ) -> None:
         self.color_encoding = color_encoding
-        self.tasks = {
-            color: load_or_tabulate(ColoredKeysEnv, tables, size=size, color=color)
-            for color in COLORS
-        }
-        num_channels = encode(self.tasks["red"].images, color_encoding).shape[-1]
+        self.tasks, self.domains = in_all_colors(tables, size)
+        num_channels = encode(self.domains.images[:1], color_encoding).shape[-1]
         self.network = GridNetwork(num_channels, width=width)
 
     def train(self, cell: Cell, seeds: list[int]) -> Iterator[tuple[int, list[Weights]]]:
@@ -338,13 +346,29 @@ class Keys:
 
         In double precision, so that a saved policy has the same return on every machine.
         """
-        images = encode(images, self.color_encoding)
-        doubled = [{name: w.double() for name, w in player.items()} for player in players]
-        return OnTable(self.network, images.double()).average(doubled)[0]
+        return self._on_table(images).average(_in_double(players))[0]
 
-    def policy(self, players: Sequence[Weights], color: str) -> np.ndarray:
-        """Probabilities ``[R, K, A]`` of the average policy in a colour, by observation."""
-        return self.logits(players, self.tasks[color].images).softmax(-1).numpy()
+    def logits_in_all_colors(self, players: Sequence[Weights]) -> torch.Tensor:
+        """The same for ``domains.images``."""
+        return self._on_domains.average(_in_double(players))[0]
+
+    def policies(
+        self, players: Sequence[Weights], colors: Sequence[str] = COLORS
+    ) -> dict[str, np.ndarray]:
+        """Probabilities ``[R, K, A]`` of the average policy in some colours, by observation."""
+        logits = self.logits_in_all_colors(players)
+        return {color: self.seen_in(color, logits).softmax(-1).numpy() for color in colors}
+
+    def seen_in(self, color: str, logits: torch.Tensor) -> torch.Tensor:
+        """Of logits in all colours those for the images of one."""
+        return logits[:, self.domains.observation_of[COLORS.index(color)]]
+
+    @functools.cached_property
+    def _on_domains(self) -> OnTable:
+        return self._on_table(self.domains.images)
+
+    def _on_table(self, images: np.ndarray) -> OnTable:
+        return OnTable(self.network, encode(images, self.color_encoding).double())
 
     def saved(self, cell: Cell, policies: Path) -> tuple[list[Weights], list[int]]:
         """Weights of the saved runs of a cell, a dictionary per player, and their seeds."""
@@ -353,13 +377,17 @@ class Keys:
         return players, about["seeds"]
 
 
+def _in_double(players: Sequence[Weights]) -> list[Weights]:
+    return [{name: w.double() for name, w in player.items()} for player in players]
+
+
 def returns(
     task: Keys, players: Sequence[Weights], colors: Sequence[str] = COLORS
 ) -> dict[tuple[str, str], np.ndarray]:
     """The exact return ``[R]`` alone of :func:`exact`, in some colours."""
     return {
-        (color, "return_exact"): expected_return(task.tasks[color], task.policy(players, color))[0]
-        for color in colors
+        (color, "return_exact"): expected_return(task.tasks[color], policy)[0]
+        for color, policy in task.policies(players, colors).items()
     }
 
 
@@ -371,8 +399,9 @@ def exact(task: Keys, players: Sequence[Weights]) -> dict[tuple[str, str], np.nd
     averaged over the observations of the colour.
     """
     metrics = {}
+    everywhere = task.logits_in_all_colors(players)
     for color, table in task.tasks.items():
-        logits = task.logits(players, table.images)
+        logits = task.seen_in(color, everywhere)
         policy = logits.softmax(-1).numpy()
         greedy = np.eye(policy.shape[-1])[policy.argmax(-1)]
         metrics[color, "return_exact"], metrics[color, "success"] = expected_return(table, policy)
@@ -387,37 +416,43 @@ def evaluate(
     task: Keys, players: Sequence[Weights], seeds: list[int]
 ) -> dict[tuple[str, str], np.ndarray]:
     """:func:`exact`, and the published protocol beside it."""
-    metrics = exact(task, players)
-    for color, table in task.tasks.items():
-        logits = task.logits(players, table.images)
-        generators = [np.random.default_rng([seed, COLORS.index(color)]) for seed in seeds]
-        metrics[color, "return_published_protocol"] = published_protocol(table, logits, generators)
-    return metrics
+    generators = [
+        [np.random.default_rng([seed, code]) for seed in seeds] for code in range(len(COLORS))
+    ]
+    logits = task.logits_in_all_colors(players)
+    by_color = zip(COLORS, published_protocol(task.domains, logits, generators), strict=True)
+    protocol = {(color, "return_published_protocol"): values for color, values in by_color}
+    return exact(task, players) | protocol
 
 
 def published_protocol(
-    table: TabularTask, logits: torch.Tensor, generators: Sequence[np.random.Generator]
+    domains: TabularDomains,
+    logits: torch.Tensor,
+    generators: Sequence[Sequence[np.random.Generator]],
 ) -> np.ndarray:
-    """Mean return ``[R]`` as the published runs measure it.
+    """Mean return ``[E, R]`` as the published runs measure it.
 
     Fifty copies act until at least a hundred episodes are over; the mean is over those. Short
     episodes end first, so they count too often, and the number is too high.
+
+    Args:
+        domains: E of them.
+        logits: ``[R, K, A]`` of what is seen in all domains together.
+        generators: R for each domain. All act side by side, as if they were E R runs.
     """
-    domain = TabularDomains([table])
-    # The distinct images of a single domain are the domain's own, in another order.
-    logits = logits[:, np.argsort(domain.observation_of[0])]
-    copies = domain([0], NUM_COPIES, generators)
+    (num_runs, num_seen, num_actions), streams = logits.shape, list(itertools.chain(*generators))
+    own = np.repeat(np.arange(len(generators)), num_runs)[:, None].repeat(NUM_COPIES, axis=1)
+    first = num_seen * torch.arange(num_runs).repeat(len(generators))[:, None]  # row of each run
+    rows, copies = logits.reshape(-1, num_actions), TabularEnvironments(domains, own, streams)
     observation = copies.reset()
-    episodes = np.zeros(len(generators))
-    total = np.zeros(len(generators))
+    episodes, total = np.zeros(len(own)), np.zeros(len(own))
     while (running := episodes < NUM_EPISODES).any():
-        rows = observation.unsqueeze(-1).expand(-1, -1, logits.shape[-1])
-        step = copies.step(Categorical.sample(logits.gather(1, rows), generators))
+        step = copies.step(Categorical.sample(rows[first + observation], streams))
         ended = (step.terminated | step.truncated).sum(1).numpy()
         episodes += running * ended
         total += running * step.reward.sum(1).numpy()
         observation = step.observation
-    return total / episodes
+    return (total / episodes).reshape(len(generators), num_runs)
 
 
 def encode(images: np.ndarray, color_encoding: str) -> torch.Tensor:
@@ -703,7 +738,7 @@ def by_temperature(
     parts = []
     for (method, players), color in itertools.product(saved.items(), colors):
         table = task.tasks[color]
-        logits = task.logits(players, table.images).numpy()
+        logits = task.seen_in(color, task.logits_in_all_colors(players)).numpy()
         policies = [policy(logits, temperature) for temperature in temperatures]
         for temperature, values in zip(temperatures, _returns_of(table, policies), strict=True):
             parts.append(_by_run(values, method=method, domain=color, temperature=temperature))
@@ -727,7 +762,7 @@ PHASES = ("searching the key", "with the key", "door unlocked")
 def visits(task: Keys, players: Sequence[Weights], color: str) -> np.ndarray:
     """Expected steps ``[phase, row, column]`` in each cell of the grid, mean over runs."""
     table = task.tasks[color]
-    spent = occupancy(table, task.policy(players, color)).mean(0)
+    spent = occupancy(table, task.policies(players, [color])[color]).mean(0)
     size = table.position.max() + 2  # the outer wall is not stood on
     grid = np.zeros((len(PHASES), size, size))
     np.add.at(grid, (table.progress, table.position[:, 1], table.position[:, 0]), spent)

@@ -45,6 +45,7 @@ def function(run: Callable) -> tuple[str, dict[str, Any]]:
     return f"{module}.{run.__qualname__}", options
 
 
+@functools.cache
 def versions() -> dict[str, str]:
     return {"python": platform.python_version(), **{name: version(name) for name in PACKAGES}}
 

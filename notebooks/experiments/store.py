@@ -12,6 +12,7 @@ Whether today's code would still give these rows is another question, and a test
 
 from __future__ import annotations
 
+import csv
 import datetime
 import hashlib
 import io
@@ -26,6 +27,7 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import pandas as pd
 from filelock import FileLock
 from tqdm import tqdm
@@ -40,6 +42,7 @@ from ipo.checks import Seeds, check_count, checked
 
 TYPES = {"str": str, "bool": bool, "int64": int, "float64": float}  # a bool is an int, too
 NO_ROWS = pd.DataFrame({"run": pd.Series(dtype=int)})
+NOWHERE = np.array([], dtype=int)
 
 Batch = dict[str, Any]
 
@@ -181,23 +184,27 @@ class Store:
         except (OSError, DamagedError) as error:
             raise ResultsError(f"{self.json.with_suffix('')}: cannot be read: {error}") from error
 
-    def _parsed(self, csv: bytes, types: dict[str, str], batches: list[Batch]) -> pd.DataFrame:
+    def _parsed(self, text: bytes, types: dict[str, str], batches: list[Batch]) -> pd.DataFrame:
         """The rows of a CSV, every batch checked; types are those of the record, never guessed."""
         try:
-            columns = pd.read_csv(io.BytesIO(csv), nrows=0).columns
+            columns = pd.read_csv(io.BytesIO(text), nrows=0).columns
             if absent := [column for column in types if column not in columns]:
                 raise ResultsError(
                     f"{self.csv}: column {absent[0]!r} is missing; needs {list(types)}"
                 )
-            rows = pd.read_csv(io.BytesIO(csv), dtype=types, keep_default_na=False)
+            rows = pd.read_csv(io.BytesIO(text), dtype=types, keep_default_na=False)
         except ResultsError:
             raise
         except ValueError as error:
             raise ResultsError(f"{self.json.with_suffix('')}: cannot be read: {error}") from error
         # Rows that no batch claims: the run was killed between the two renames. They are
         # computed again.
-        parts = [self._checked(rows, batch) for batch in batches]
-        return pd.concat(parts, ignore_index=True)
+        kinds, lines = {tuple(batch["columns"]) for batch in batches}, _lines(rows)
+        places = {names: rows.groupby([*names, "run"]).indices for names in kinds}
+        own = [_where(batch, places[tuple(batch["columns"])]) for batch in batches]
+        for batch, chosen in zip(batches, own, strict=True):
+            self._check_batch(batch, lines[chosen])
+        return rows.iloc[np.concatenate(own)].reset_index(drop=True)
 
     def _record(self) -> tuple[dict[str, str], list[Batch]]:
         """The types of the columns of the rows that there are, and the batches."""
@@ -214,14 +221,12 @@ class Store:
             raise ResultsError(f"{self.json.with_suffix('')}: cannot be read: {error}") from error
         return types if batches else {}, batches
 
-    def _checked(self, rows: pd.DataFrame, batch: Batch) -> pd.DataFrame:
-        part = select(rows[rows["run"].isin(batch["seeds"])], batch["columns"])
-        if len(part) != batch["num_rows"] or digest(part) != batch["sha256"]:
+    def _check_batch(self, batch: Batch, lines: np.ndarray) -> None:
+        if len(lines) != batch["num_rows"] or _hash(lines) != batch["sha256"]:
             raise ResultsError(
                 f"{self.csv}: the rows of {batch['columns']} are cut short or changed: "
-                f"{len(part)} rows, {batch['num_rows']} were written; restore the file"
+                f"{len(lines)} rows, {batch['num_rows']} were written; restore the file"
             )
-        return part
 
     def _check_origin(
         self, experiment: Experiment, cell: Cell, seeds: Sequence[int], batch: Batch
@@ -280,7 +285,7 @@ class Store:
             self.write_record(together, batches)
 
     def _check_comes_back(
-        self, cell: Cell, csv: bytes, types: dict[str, str], batches: list[Batch]
+        self, cell: Cell, text: bytes, types: dict[str, str], batches: list[Batch]
     ) -> None:
         """Whether what is about to be written gives the same rows when it is read."""
         not_saved = f"{self.csv}: rows of {cell.columns} were not saved"
@@ -288,7 +293,7 @@ class Store:
         if recorded not in ({}, types):
             raise ResultsError(f"{not_saved}: they have {types}, those of the file {recorded}")
         try:
-            self._parsed(csv, types, batches)
+            self._parsed(text, types, batches)
         except ResultsError as error:
             raise ResultsError(f"{not_saved}: they would not come back as they are") from error
 
@@ -364,9 +369,32 @@ def select(rows: pd.DataFrame, columns: dict[str, Any]) -> pd.DataFrame:
 
 def digest(rows: pd.DataFrame) -> str:
     """A hash of rows that does not depend on their order."""
+    return _hash(_lines(rows))
+
+
+class _Lines(list):
+    """What the csv module takes for a file; it writes a row at a time."""
+
+    write = list.append
+
+
+def _lines(rows: pd.DataFrame) -> np.ndarray:
+    """Each row as a line of a CSV, its value last."""
     columns = [*sorted(set(rows.columns) - {"value"}), "value"]
-    lines = rows[columns].to_csv(index=False, header=False).splitlines()
+    lines = _Lines()
+    in_order = rows[columns].itertuples(index=False, name=None)
+    csv.writer(lines, lineterminator="").writerows(in_order)
+    return np.array(lines, dtype=object)
+
+
+def _hash(lines: np.ndarray) -> str:
     return hashlib.sha256("\n".join(sorted(lines)).encode()).hexdigest()[:16]
+
+
+def _where(batch: Batch, places: dict[tuple, np.ndarray]) -> np.ndarray:
+    """Which rows are those of a batch, by the places of its columns' values and each run."""
+    values = batch["columns"].values()
+    return np.sort(np.concatenate([places.get((*values, s), NOWHERE) for s in batch["seeds"]]))
 
 
 def _lacking(cell: Cell, seeds: Iterable[int], batches: list[Batch]) -> list[int]:

@@ -36,7 +36,7 @@ from experiments.tables import beside_shipped
 from experiments.visits import occupancy
 from ipo.worlds.colored_keys import COLORS
 from ipo.worlds.networks import GridNetwork
-from ipo.worlds.tabular import TabularTask, expected_return
+from ipo.worlds.tabular import TabularDomains, TabularTask, expected_return
 
 DATA = Path(__file__).resolve().parents[2] / "data"
 RESULTS, POLICIES = DATA / "results" / "keys", DATA / "policies" / "keys"
@@ -72,6 +72,16 @@ def corridor(starts: list[float], horizon: int = 6) -> TabularTask:
     )
 
 
+def in_a_domain(
+    task: TabularTask, logits: torch.Tensor, generators: list[np.random.Generator]
+) -> np.ndarray:
+    """The protocol in the only domain there is; logits are of the task's own images."""
+    domains = TabularDomains([task])
+    logits = logits[:, np.argsort(domains.observation_of[0])]
+    (found,) = published_protocol(domains, logits, [generators])
+    return found
+
+
 def slow_protocol(
     task: TabularTask, probabilities: np.ndarray, rng: np.random.Generator
 ) -> tuple[float, int]:
@@ -101,7 +111,7 @@ def test_published_protocol_by_hand(go):
     task = corridor([0.25, 0.25, 0.5])
     probabilities = np.array([[1 - go, go], [1 - go / 2, go / 2], [0.5, 0.5]])
     logits = torch.tensor(np.stack([probabilities] * 3)).log()
-    found = published_protocol(task, logits, [np.random.default_rng(run) for run in range(3)])
+    found = in_a_domain(task, logits, [np.random.default_rng(run) for run in range(3)])
     slow = [slow_protocol(task, probabilities, np.random.default_rng(run)) for run in range(3)]
     assert found == pytest.approx([mean for mean, _ in slow], rel=1e-6)
     assert all(count >= 100 for _, count in slow)
@@ -110,7 +120,7 @@ def test_published_protocol_by_hand(go):
 def test_protocol_of_the_only_episode_there_is():
     """Everybody reaches the goal in the second step: two rounds of fifty are over after four."""
     logits = torch.tensor([[[-100.0, 100.0]] * 2])
-    found = published_protocol(corridor([1.0, 0.0]), logits, [np.random.default_rng(0)])
+    found = in_a_domain(corridor([1.0, 0.0]), logits, [np.random.default_rng(0)])
     assert found == pytest.approx([1 - 0.9 * 2 / 6])
 
 
@@ -121,7 +131,7 @@ def test_protocol_favours_short_episodes():
     (value,), _ = expected_return(task, policy[None])
     assert value == pytest.approx(0.5 * (1 - 0.9 / 6))
     logits = torch.tensor(np.stack([policy] * 100)).clamp(1e-30).log()
-    found = published_protocol(task, logits, [np.random.default_rng(run) for run in range(100)])
+    found = in_a_domain(task, logits, [np.random.default_rng(run) for run in range(100)])
     assert found.mean() - value > 10 * found.std() / 10
 
 
@@ -134,7 +144,7 @@ def test_protocol_of_the_coloured_keys_by_hand(keys):
     votes[np.arange(289), best[rng.integers(0, 6, size=289)]] = 1
     probabilities = 0.3 * votes + 0.1
     logits = torch.tensor(probabilities)[None].log()
-    (found,) = published_protocol(task, logits, [np.random.default_rng(1)])
+    (found,) = in_a_domain(task, logits, [np.random.default_rng(1)])
     assert 0 < found < 1
     assert found == pytest.approx(slow_protocol(task, probabilities, np.random.default_rng(1))[0])
 
@@ -210,6 +220,15 @@ def test_exact_metrics_are_those_of_the_average_policy(trained):
     assert metrics["yellow", "return_greedy"] == pytest.approx(expected_return(table, greedy)[0])
     steps = [metrics["yellow", name] for name in ("reaches_key", "unlocks_door", "success")]
     assert (steps[0] > steps[1]).all() and (steps[1] > steps[2]).all()
+
+
+def test_protocol_in_all_colours_is_that_of_each_alone(trained):
+    task, players = trained
+    metrics = evaluate(task, players, [3, 4])
+    for code, (color, table) in enumerate(task.tasks.items()):
+        generators = [np.random.default_rng([seed, code]) for seed in (3, 4)]
+        alone = in_a_domain(table, task.logits(players, table.images), generators)
+        assert metrics[color, "return_published_protocol"] == pytest.approx(alone, rel=1e-12)
 
 
 def test_evaluation_of_a_run_does_not_depend_on_the_others(trained):
@@ -729,7 +748,7 @@ def test_visits_count_every_step_in_the_cell_where_it_is_spent(trained):
     table = task.tasks["red"]
     assert spent.shape == (3, 5, 5)
     assert (spent[:, [0, -1], :] == 0).all() and (spent[:, :, [0, -1]] == 0).all()
-    steps = occupancy(table, task.policy(players, "red")).mean(0)
+    steps = occupancy(table, task.policies(players, ["red"])["red"]).mean(0)
     assert spent.sum() == pytest.approx(steps.sum()) and steps.sum() <= table.horizon
     x, y = table.position[7]
     here = (table.position == (x, y)).all(1) & (table.progress == table.progress[7])

@@ -11,7 +11,8 @@ import toy_experiment
 from toy_experiment import CELLS, Cell
 
 from experiments import confirm, origin, registry, witness
-from experiments.experiment import Experiment
+from experiments.experiment import Experiment, rebuilt
+from experiments.games import played
 from experiments.store import Store
 
 SHIFT = {"cost": 0.0}
@@ -141,6 +142,25 @@ def ends(phase: float, shift: float = 0.0, size: float = 1.0) -> pd.DataFrame:
 def test_where_an_unsettled_training_may_end(now, before, expected):
     both = witness.side_by_side(ends(0.0), now)
     assert confirm.unsettled(both, before) == expected
+
+
+@pytest.mark.parametrize(("moved", "expected"), [(0.6, True), (0.4, False)])
+def test_a_single_run_may_be_elsewhere_by_twice_what_it_moves(moved, expected):
+    def alone(number: int, value: float) -> pd.DataFrame:
+        return pd.DataFrame(
+            {"round": [number], "run": 0, "domain": "d", "metric": "m", "value": value}
+        )
+
+    both = witness.side_by_side(alone(100, 5.0), alone(100, 6.0))
+    assert confirm.unsettled(both, alone(98, 6.0 - moved)) == expected
+
+
+def test_only_the_end_of_a_game_may_be_elsewhere():
+    parts = confirm.full_batches(["algorithm/averages"])
+    cells = [rebuilt(played.Trajectory, part.batch["cell"]) for part in parts]
+    before = {cell.on_the_way: played.earlier(cell) for cell in cells}
+    assert before[True] is None
+    assert before[False].game.settings.num_rounds == 1470
 
 
 @pytest.mark.parametrize(("moves", "how"), [(0.0, "differs"), (2.0, "unsettled")])

@@ -115,7 +115,8 @@ def _alone(training: Training, d: int, num_updates: int) -> list[Weights]:
 
 def _scores(task: Keys, player: Weights, colors: Sequence[str]) -> Tensor:
     """What a player alone says ``[R, observations, A]``, up to what the softmax ignores."""
-    scores = torch.cat([task.logits([player], task.tasks[color].images) for color in colors], dim=1)
+    everywhere = task.logits_in_all_colors([player])
+    scores = torch.cat([task.seen_in(color, everywhere) for color in colors], dim=1)
     return scores - scores.mean(-1, keepdim=True)
 
 

@@ -57,7 +57,8 @@ def _packed_runs(
     task: Keys, players: Sequence[Weights], colors: Sequence[str]
 ) -> Iterator[tuple[str, ...]]:
     """Of every run, a text for each colour."""
-    logits = [task.logits(players, task.tasks[color].images)[:NUM_RUNS] for color in colors]
+    everywhere = task.logits_in_all_colors(players)[:NUM_RUNS]
+    logits = [task.seen_in(color, everywhere) for color in colors]
     by_color = [[_packed(run) for run in of_color.log_softmax(-1).numpy()] for of_color in logits]
     return zip(*by_color, strict=True)
 
