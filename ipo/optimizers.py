@@ -91,7 +91,7 @@ def step(
     def closure() -> float:
         costs, gradients = known.pop() if known else again()
         for leaf, gradient in zip(leaves, gradients, strict=True):
-            leaf.grad = _clip(gradient, max_gradient_norm)
+            leaf.grad = clip_gradient(gradient, max_gradient_norm)
         return float(costs.sum())
 
     optimizer.step(closure)
@@ -103,7 +103,8 @@ def _leaves(optimizer: torch.optim.Optimizer) -> list[Tensor]:
     return [leaf for group in optimizer.param_groups for leaf in group["params"]]
 
 
-def _clip(gradient: Tensor, max_norm: float | None) -> Tensor:
+def clip_gradient(gradient: Tensor, max_norm: float | None) -> Tensor:
+    """A gradient ``[runs, ...]``, scaled so that its norm is at most ``max_norm`` in each run."""
     if max_norm is None:
         return gradient
     dims = tuple(range(1, gradient.dim()))

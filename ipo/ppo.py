@@ -31,6 +31,7 @@ from ipo.checks import (
 from ipo.distributions import Distribution, Generators
 from ipo.game import Move, moves, play_round
 from ipo.networks import Network, Outputs, PullBack, Weights, chosen_rows, in_one_row
+from ipo.optimizers import clip_gradient
 from ipo.rollouts import Collector, Device, Environments, Rollout, TimeOuts
 
 METHODS = ("ppo", "ipo", "ensemble", "in_turn")
@@ -470,9 +471,3 @@ def _errors(values: Tensor, batch: Rollout, settings: PPOSettings) -> tuple[Tens
 def standardize(gains: Tensor) -> Tensor:
     """``[R, B]`` with mean 0 and standard deviation 1 in each run."""
     return (gains - gains.mean(1, True)) / (gains.std(1, keepdim=True) + 1e-8)
-
-
-def clip_gradient(gradient: Tensor, max_norm: float) -> Tensor:
-    """A player's gradient ``[R, P]``, scaled so that its norm is at most max_norm in each run."""
-    norm = torch.linalg.vector_norm(gradient, dim=1, keepdim=True)
-    return gradient * (max_norm / norm).clamp(max=1.0)

@@ -24,11 +24,11 @@ from experiments.regularized.networks import RegularizedSettings, training_of
 from ipo.distributions import Categorical, Gaussian
 from ipo.game import moves
 from ipo.networks import Weights, copied
+from ipo.optimizers import clip_gradient
 from ipo.ppo import (
     METHODS,
     PPOSettings,
     Training,
-    clip_gradient,
     clipped_loss,
     loss_gradient,
     minibatches,
