@@ -15,6 +15,7 @@ import numpy as np
 import pandas as pd
 
 from experiments.doors.arms import (
+    CONTROLS,
     NAMES,
     PUBLISHED,
     mean_rate,
@@ -25,9 +26,10 @@ from experiments.doors.arms import (
 from experiments.doors.authors_policies import authors_policies
 from experiments.doors.success import Cell
 from experiments.doors.training import CURVE_FRICTION, EVALUATION_SEED, TRAIN_FRICTIONS, last_info
+from experiments.tables import mean_and_std
 from experiments.work import parallel
 from ipo.ppo import PPOSettings
-from ipo.stats import paired_difference, probability_of_improvement
+from ipo.stats import paired_difference, power, probability_of_improvement
 
 PAIRS = {
     "published": ("ipo_half", "ppo"),
@@ -171,6 +173,36 @@ def comparison_numbers(compared: pd.DataFrame) -> dict[str, Any]:
         for _, row in compared.iterrows()
         for end, column in columns.items()
     }
+
+
+def controlled(
+    success: pd.DataFrame, arms: Mapping[str, Cell], tested: Sequence[float], effect: float
+) -> pd.DataFrame:
+    """How many points more IPO, as published, opens than what was trained as long.
+
+    Paired over the runs that both have. ``power``: with which so many pairs, spread as they are,
+    would find ``effect`` points.
+    """
+    ipo = mean_rate(success, arms["ipo_half"], tested)
+    rows = []
+    for arm, name in CONTROLS.items():
+        other = mean_rate(success, arms[arm], tested)
+        runs = ipo.index.intersection(other.index)
+        own, base = 100 * ipo[runs], 100 * other[runs]
+        found = paired_difference(own, base)
+        rows.append(
+            {
+                "key": arm,
+                "IPO minus": name,
+                "pairs": len(runs),
+                "it opens": mean_and_std(base),
+                "difference": found.mean,
+                "95 %": f"[{found.low:+.1f}, {found.high:+.1f}]",
+                "p": found.p,
+                "power": power(effect, (own - base).std(), len(runs)),
+            }
+        )
+    return pd.DataFrame(rows)
 
 
 def gaps_of_draws(
