@@ -17,6 +17,7 @@ from experiments.doors.arms import (
     arms_of,
     cell_of,
     controls,
+    controls_of,
     mean_rate,
     rate,
     rate_by_friction,
@@ -30,7 +31,6 @@ from ipo.worlds.door import DoorEnv
 FRICTIONS = (1.1, 1.5)
 NUM_DOORS = 4
 ARMS = arms_of(trainings(4, 512), frictions=FRICTIONS, num_doors=NUM_DOORS)
-CELLS = controls(4, 512)
 PARTS = {"ppo_half": [0.9, 0.1], "ppo": [0.9, 0.9], "ipo_half": [0.5, 0.9], "ipo": [0.1, 0.1]}
 
 
@@ -137,14 +137,11 @@ def test_comparisons_of_two_arms(success):
 
 def test_controls_are_paired_with_the_runs_of_ipo_that_they_have(success):
     """Runs 0 and 1 of a control, of IPO's three."""
-    arms = ARMS | {
-        name: replace(ARMS["ppo"], trained=cell, updates=2) for name, cell in CELLS.items()
-    }
+    arms = ARMS | controls_of(controls(4, 512), frictions=FRICTIONS, num_doors=NUM_DOORS)
+    of_ppo = success.query("method == 'ppo' and steps == 32768 and run < 2")
     opened = {"ensemble": [0.5, 0.25], "in_turn": [0.25, 0.5], "ipo_lr1e-3": [0.0, 0.5]}
     rows = pd.concat(
-        success[success["steps"] == 32768][success["method"] == "ppo"][success["run"] < 2].assign(
-            method=name, value=lambda own, name=name: own["run"].map(dict(enumerate(opened[name])))
-        )
+        of_ppo.assign(method=name, value=of_ppo["run"].map(dict(enumerate(opened[name]))))
         for name in opened
     )
     table = door_tables.controlled(pd.concat([success, rows]), arms, FRICTIONS, effect=10.0)

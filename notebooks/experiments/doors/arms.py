@@ -1,4 +1,4 @@
-"""The four arms of the chapter on doors, from two trainings, and which rows are theirs.
+"""The arms of the chapter on doors, four from two trainings, and controls; rows of an arm.
 
 An arm is a cell of :mod:`experiments.doors.success`; its rows are those with the cell's columns.
 """
@@ -49,6 +49,11 @@ def controls(num_updates: int, num_steps: int) -> dict[str, door_training.Cell]:
     """Trainings beside these, until half time: what a difference is due to."""
     every = _curve_every(num_updates)
     return door_training.controls(num_updates // 2, every, **_sizes(num_steps))
+
+
+def controls_of(trained: Mapping[str, door_training.Cell], **options: Any) -> dict[str, Cell]:
+    """Their policies in the end; ``options`` of :class:`Cell`."""
+    return {label: Cell(cell, *cell.saved_after, **options) for label, cell in trained.items()}
 
 
 def _sizes(num_steps: int) -> dict[str, int]:
