@@ -189,7 +189,7 @@ def controlled(
         other = mean_rate(success, arms[arm], tested)
         runs = ipo.index.intersection(other.index)
         own, base = 100 * ipo[runs], 100 * other[runs]
-        found = paired_difference(own, base)
+        found, spread = paired_difference(own, base), (own - base).std()
         rows.append(
             {
                 "key": arm,
@@ -199,10 +199,18 @@ def controlled(
                 "difference": found.mean,
                 "95 %": f"[{found.low:+.1f}, {found.high:+.1f}]",
                 "p": found.p,
-                "power": power(effect, (own - base).std(), len(runs)),
+                "power": power(effect, spread, len(runs)) if spread else 1.0,
             }
         )
     return pd.DataFrame(rows)
+
+
+def control_numbers(controlled: pd.DataFrame) -> dict[str, Any]:
+    """Difference and interval of every control, and the largest power of all."""
+    rows = controlled.set_index("key")
+    numbers = {f"control_{arm}": rows.loc[arm, "difference"] for arm in rows.index}
+    intervals = {f"control_{arm}_interval": rows.loc[arm, "95 %"] for arm in rows.index}
+    return numbers | intervals | {"control_power": rows["power"].max()}
 
 
 def gaps_of_draws(
@@ -243,13 +251,18 @@ def verdict_numbers(
             found[f"rate_{arm}_{place}"] = 100 * rate(success, arms[arm], friction).mean()
             found[f"paper_{method}_{place}"] = 100 * means[method, str(friction)]
     steps = {arm: gradient_steps(arms[arm]) for arm in ("ppo", "ipo")}
-    gaps = [means["ipo", str(friction)] - means["ppo", str(friction)] for friction in tested]
     return found | {
-        "paper_gap": 100 * np.mean(gaps),
+        "paper_gap": paper_gap(paper, tested),
         "gradient_steps": steps["ppo"],
         "gradient_ratio": steps["ipo"] / steps["ppo"],
         "num_minibatches": arms["ipo"].trained.settings.num_minibatches,
     }
+
+
+def paper_gap(paper: pd.DataFrame, tested: Sequence[float]) -> float:
+    """How many points more the paper's IPO opens, mean over the test frictions."""
+    means = paper.set_index(["method", "domain"])["mean"]
+    return 100 * np.mean([means["ipo", str(f)] - means["ppo", str(f)] for f in tested])
 
 
 def gradient_steps(cell: Cell) -> float:
