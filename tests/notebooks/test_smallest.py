@@ -57,6 +57,7 @@ SMALLEST = {
     },
     "door": {
         "num_runs": 2,
+        "num_control_runs": 2,
         "num_updates": 2,
         "num_steps": 512,  # an episode
         "num_doors": 2,  # as many as are watched

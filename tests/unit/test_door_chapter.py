@@ -12,7 +12,17 @@ from experiments.doors import figures as door_figures
 from experiments.doors import tables as door_tables
 from experiments.doors import training as door_training
 from experiments.doors import ways as door_ways
-from experiments.doors.arms import arms_of, cell_of, mean_rate, rate, rate_by_friction, trainings
+from experiments.doors.arms import (
+    CONTROLS,
+    arms_of,
+    cell_of,
+    controls,
+    controls_of,
+    mean_rate,
+    rate,
+    rate_by_friction,
+    trainings,
+)
 from experiments.doors.success import door_seeds, evaluation_doors
 from experiments.doors.training import NETWORK, made_for, policy_path
 from experiments.policies import save_policy
@@ -82,6 +92,14 @@ def test_arms_are_two_trainings_at_two_times():
     assert trainings(2, 512)["ipo"].settings.num_minibatches == 32
 
 
+def test_controls_are_trained_as_long_as_ipo_as_published():
+    assert controls(190, 4096) == door_training.controls()
+    assert {*controls(4, 512)} == {*CONTROLS} - {"ppo_half"}
+    for cell in controls(4, 512).values():
+        assert (cell.settings.num_updates, cell.saved_after) == (2, (2,))
+        assert cell.settings.num_minibatches == 32
+
+
 def test_an_arm_has_its_own_rows_only(success):
     assert list(rate(success, ARMS["ppo"], 1.1)) == [0.5] * 3
     assert list(rate(success, ARMS["ppo"], 1.5)) == [0] * 3
@@ -115,6 +133,22 @@ def test_comparisons_of_two_arms(success):
     assert found["equal_full_hardest_interval"] == "[+100.0, +100.0]"
     assert (found["published_all_better"], found["longer_ppo_hardest_better"]) == (1, 0)
     assert len(compared) == 2 * len(door_tables.PAIRS)
+
+
+def test_controls_are_paired_with_the_runs_of_ipo_that_they_have(success):
+    """Runs 0 and 1 of a control, of IPO's three."""
+    arms = ARMS | controls_of(controls(4, 512), frictions=FRICTIONS, num_doors=NUM_DOORS)
+    of_ppo = success.query("method == 'ppo' and steps == 32768 and run < 2")
+    opened = {"ensemble": [0.5, 0.25], "in_turn": [0.25, 0.5], "ipo_lr1e-3": [0.0, 0.5]}
+    rows = pd.concat(
+        of_ppo.assign(method=name, value=of_ppo["run"].map(dict(enumerate(opened[name]))))
+        for name in opened
+    )
+    table = door_tables.controlled(pd.concat([success, rows]), arms, FRICTIONS, effect=10.0)
+    assert list(table["pairs"]) == [3, 2, 2, 2]
+    assert list(table["difference"]) == pytest.approx([100 / 3, 12.5, 12.5, 25.0])
+    assert list(table["it opens"])[1] == "37.5 ± 12.5"
+    assert table["power"].between(0.05, 1).all()
 
 
 def test_runs_are_compared_in_pairs():

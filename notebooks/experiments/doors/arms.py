@@ -1,4 +1,4 @@
-"""The four arms of the chapter on doors, from two trainings, and which rows are theirs.
+"""The arms of the chapter on doors, four from two trainings, and controls; rows of an arm.
 
 An arm is a cell of :mod:`experiments.doors.success`; its rows are those with the cell's columns.
 """
@@ -22,25 +22,47 @@ NAMES = {
     "ipo_half": "IPO, as published",
     "ipo": "IPO, as in the text",
 }
+CONTROLS = {
+    "ppo_half": "PPO",
+    "ensemble": "two networks, each on all doors",
+    "in_turn": "one network, one domain at a time",
+    "ipo_lr1e-3": "IPO with PPO's learning rate",
+}  # as long as IPO as published was trained
 PUBLISHED = ("ppo", "ipo_half")  # with the steps of the published runs
 
 
 def trainings(num_updates: int, num_steps: int) -> dict[str, door_training.Cell]:
     """PPO and IPO as published, saved at half time and in the end; minibatches keep their size."""
-    changes = {
-        "num_updates": num_updates,
-        "num_steps": num_steps,
-        "num_minibatches": max(1, 256 * num_steps // 4096),
-    }
+    changes = {"num_updates": num_updates, **_sizes(num_steps)}
     return {
         method: door_training.Cell(
             method,
             door_training.published_door(method, **changes),
             saved_after=(num_updates // 2, num_updates),
-            curve_every=max(num_updates // 19, 1),
+            curve_every=_curve_every(num_updates),
         )
         for method in ("ppo", "ipo")
     }
+
+
+def controls(num_updates: int, num_steps: int) -> dict[str, door_training.Cell]:
+    """Trainings beside these, until half time: what a difference is due to."""
+    every = _curve_every(num_updates)
+    return door_training.controls(num_updates // 2, every, **_sizes(num_steps))
+
+
+def controls_of(trained: Mapping[str, door_training.Cell], **options: Any) -> dict[str, Cell]:
+    """Their policies in the end; ``options`` of :class:`Cell`."""
+    return {label: Cell(cell, *cell.saved_after, **options) for label, cell in trained.items()}
+
+
+def _sizes(num_steps: int) -> dict[str, int]:
+    """Of rollouts, and how many minibatches keep their size."""
+    return {"num_steps": num_steps, "num_minibatches": max(1, 256 * num_steps // 4096)}
+
+
+def _curve_every(num_updates: int) -> int:
+    return max(num_updates // 19, 1)
 
 
 def arms_of(trained: Mapping[str, door_training.Cell], **options: Any) -> dict[str, Cell]:

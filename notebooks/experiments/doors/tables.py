@@ -15,6 +15,7 @@ import numpy as np
 import pandas as pd
 
 from experiments.doors.arms import (
+    CONTROLS,
     NAMES,
     PUBLISHED,
     mean_rate,
@@ -25,9 +26,10 @@ from experiments.doors.arms import (
 from experiments.doors.authors_policies import authors_policies
 from experiments.doors.success import Cell
 from experiments.doors.training import CURVE_FRICTION, EVALUATION_SEED, TRAIN_FRICTIONS, last_info
+from experiments.tables import mean_and_std
 from experiments.work import parallel
 from ipo.ppo import PPOSettings
-from ipo.stats import paired_difference, probability_of_improvement
+from ipo.stats import paired_difference, power, probability_of_improvement
 
 PAIRS = {
     "published": ("ipo_half", "ppo"),
@@ -173,6 +175,44 @@ def comparison_numbers(compared: pd.DataFrame) -> dict[str, Any]:
     }
 
 
+def controlled(
+    success: pd.DataFrame, arms: Mapping[str, Cell], tested: Sequence[float], effect: float
+) -> pd.DataFrame:
+    """How many points more IPO, as published, opens than what was trained as long.
+
+    Paired over the runs that both have. ``power``: with which so many pairs, spread as they are,
+    would find ``effect`` points.
+    """
+    ipo = mean_rate(success, arms["ipo_half"], tested)
+    rows = []
+    for arm, name in CONTROLS.items():
+        other = mean_rate(success, arms[arm], tested)
+        runs = ipo.index.intersection(other.index)
+        own, base = 100 * ipo[runs], 100 * other[runs]
+        found, spread = paired_difference(own, base), (own - base).std()
+        rows.append(
+            {
+                "key": arm,
+                "IPO minus": name,
+                "pairs": len(runs),
+                "it opens": mean_and_std(base),
+                "difference": found.mean,
+                "95 %": f"[{found.low:+.1f}, {found.high:+.1f}]",
+                "p": found.p,
+                "power": power(effect, spread, len(runs)) if spread else 1.0,
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+def control_numbers(controlled: pd.DataFrame) -> dict[str, Any]:
+    """Difference and interval of every control, and the largest power of all."""
+    rows = controlled.set_index("key")
+    numbers = {f"control_{arm}": rows.loc[arm, "difference"] for arm in rows.index}
+    intervals = {f"control_{arm}_interval": rows.loc[arm, "95 %"] for arm in rows.index}
+    return numbers | intervals | {"control_power": rows["power"].max()}
+
+
 def gaps_of_draws(
     success: pd.DataFrame,
     arms: Mapping[str, Cell],
@@ -211,13 +251,18 @@ def verdict_numbers(
             found[f"rate_{arm}_{place}"] = 100 * rate(success, arms[arm], friction).mean()
             found[f"paper_{method}_{place}"] = 100 * means[method, str(friction)]
     steps = {arm: gradient_steps(arms[arm]) for arm in ("ppo", "ipo")}
-    gaps = [means["ipo", str(friction)] - means["ppo", str(friction)] for friction in tested]
     return found | {
-        "paper_gap": 100 * np.mean(gaps),
+        "paper_gap": paper_gap(paper, tested),
         "gradient_steps": steps["ppo"],
         "gradient_ratio": steps["ipo"] / steps["ppo"],
         "num_minibatches": arms["ipo"].trained.settings.num_minibatches,
     }
+
+
+def paper_gap(paper: pd.DataFrame, tested: Sequence[float]) -> float:
+    """How many points more the paper's IPO opens, mean over the test frictions."""
+    means = paper.set_index(["method", "domain"])["mean"]
+    return 100 * np.mean([means["ipo", str(f)] - means["ppo", str(f)] for f in tested])
 
 
 def gradient_steps(cell: Cell) -> float:

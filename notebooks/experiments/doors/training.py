@@ -91,24 +91,32 @@ class Cell:
         return {"method": self.label, "train_frictions": "+".join(map(str, TRAIN_FRICTIONS))}
 
 
-PUBLISHED_UPDATES = 95  # after which the published training of IPO ended
+def controls(num_updates: int = 95, curve_every: int = 10, **changes: Any) -> dict[str, Cell]:
+    """Arms that show what a difference between IPO and PPO is due to, with IPO's doors and rate.
+
+    They end where the published training of IPO did: the ensemble, whose players learn from all
+    doors; one network that learns from one domain at a time; IPO with PPO's learning rate.
+    """
+    differences = {
+        "ensemble": ("ensemble", 5e-4),
+        "in_turn": ("in_turn", 5e-4),
+        "ipo_lr1e-3": ("ipo", 1e-3),
+    }
+    return {
+        label: Cell(
+            label,
+            published_door(method, learning_rate=rate, num_updates=num_updates, **changes),
+            saved_after=(num_updates,),
+            curve_every=curve_every,
+        )
+        for label, (method, rate) in differences.items()
+    }
 
 
-def control(label: str, method: str, learning_rate: float) -> Cell:
-    """An arm that shows what a difference is due to; it ends where IPO's published training did."""
-    changes = {"learning_rate": learning_rate, "num_updates": PUBLISHED_UPDATES}
-    return Cell(label, published_door(method, **changes), saved_after=(PUBLISHED_UPDATES,))
-
-
-CONTROLS = {
-    "ensemble": control("ensemble", "ensemble", 5e-4),
-    "in_turn": control("in_turn", "in_turn", 5e-4),
-    "ipo_lr1e-3": control("ipo_lr1e-3", "ipo", 1e-3),
-}
 CELLS = {
     "ppo": Cell("ppo", published_door("ppo")),
     "ipo": Cell("ipo", published_door("ipo")),
-    **CONTROLS,
+    **controls(),
 }
 
 
