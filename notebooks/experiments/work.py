@@ -45,7 +45,15 @@ def finished(
         yield from _on_cluster(jobs, scheduler)
     else:
         run = parallel(num_workers, return_as="generator_unordered")
-        yield from run(joblib.delayed(job)() for job in jobs)
+        yield from run(joblib.delayed(_in_one_thread)(job) for job in jobs)
+
+
+def _in_one_thread(job: Job) -> Any:
+    """As on any worker, so that rows do not depend on who computes them, and threads not wait."""
+    from ipo.own_domains.threads import one_thread  # torch, which those who only read do not need
+
+    with one_thread():
+        return job()
 
 
 def parallel(num_workers: int | None, **options: Any) -> joblib.Parallel:

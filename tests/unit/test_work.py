@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 
 import pytest
+import torch
 import toy_experiment
 from toy_experiment import CELLS, fill
 
@@ -22,6 +23,13 @@ cluster = LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None
 print(cluster.scheduler_address, flush=True)
 input()
 """
+
+
+@pytest.mark.parametrize("num_workers", [1, 2])
+def test_a_job_has_one_thread_whoever_runs_it(num_workers):
+    before = torch.get_num_threads()
+    assert list(finished([torch.get_num_threads] * 2, num_workers)) == [1, 1]
+    assert torch.get_num_threads() == before
 
 
 @pytest.fixture(scope="module")

@@ -24,9 +24,7 @@ NAMES = {
 }
 CONTROLS = {
     "ppo_half": "PPO",
-    "ensemble": "two networks, each on all doors",
     "in_turn": "one network, one domain at a time",
-    "ipo_lr1e-3": "IPO with PPO's learning rate",
 }  # as long as IPO as published was trained
 PUBLISHED = ("ppo", "ipo_half")  # with the steps of the published runs
 
@@ -48,7 +46,8 @@ def trainings(num_updates: int, num_steps: int) -> dict[str, door_training.Cell]
 def controls(num_updates: int, num_steps: int) -> dict[str, door_training.Cell]:
     """Trainings beside these, until half time: what a difference is due to."""
     every = _curve_every(num_updates)
-    return door_training.controls(num_updates // 2, every, **_sizes(num_steps))
+    declared = door_training.controls(num_updates // 2, every, **_sizes(num_steps))
+    return {label: cell for label, cell in declared.items() if label in CONTROLS}
 
 
 def controls_of(trained: Mapping[str, door_training.Cell], **options: Any) -> dict[str, Cell]:
