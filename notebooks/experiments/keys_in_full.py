@@ -15,7 +15,8 @@ from typing import Any
 
 import pandas as pd
 
-from experiments.keys import TESTED, TRAINED, Cell, arm, gap, main_arms, runs_of
+from experiments.keys import TESTED, TRAINED, Cell, arm, main_arms
+from experiments.keys_tables import gap, runs_of
 from experiments.tables import mean_and_std
 
 NAMES = {

@@ -25,7 +25,8 @@ from sklearn.cluster import KMeans
 
 from experiments import keys
 from experiments.experiment import Experiment
-from experiments.keys import TESTED, Keys, evaluate, gap, runs_of
+from experiments.keys import TESTED, Keys, evaluate
+from experiments.keys_tables import gap, runs_of
 from experiments.rows import tidy
 from experiments.tables import mean_and_std
 from experiments.visits import occupancy

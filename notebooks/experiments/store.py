@@ -200,7 +200,7 @@ class Store:
         # Rows that no batch claims: the run was killed between the two renames. They are
         # computed again.
         kinds, lines = {tuple(batch["columns"]) for batch in batches}, _lines(rows)
-        places = {names: rows.groupby([*names, "run"]).indices for names in kinds}
+        places = {names: _places(rows, names) for names in kinds}
         own = [_where(batch, places[tuple(batch["columns"])]) for batch in batches]
         for batch, chosen in zip(batches, own, strict=True):
             self._check_batch(batch, lines[chosen])
@@ -389,6 +389,12 @@ def _lines(rows: pd.DataFrame) -> np.ndarray:
 
 def _hash(lines: np.ndarray) -> str:
     return hashlib.sha256("\n".join(sorted(lines)).encode()).hexdigest()[:16]
+
+
+def _places(rows: pd.DataFrame, names: Sequence[str]) -> dict[tuple, np.ndarray]:
+    """By the values of these columns and the run, which rows have them."""
+    found = rows.groupby([*names, "run"]).indices
+    return found if names else {(run,): where for run, where in found.items()}
 
 
 def _where(batch: Batch, places: dict[tuple, np.ndarray]) -> np.ndarray:

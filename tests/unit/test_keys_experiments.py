@@ -26,8 +26,8 @@ from experiments.keys import (
     returns,
     run_cell,
     run_curve,
-    runs_of,
 )
+from experiments.keys_tables import runs_of
 from experiments.policies import load_policy
 from experiments.registry import CHAPTERS
 from experiments.regularized import trials
