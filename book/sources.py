@@ -6,6 +6,7 @@ It decides whether a notebook is executed again, and nothing about results.
 from __future__ import annotations
 
 import ast
+import functools
 import hashlib
 import io
 import tokenize
@@ -48,6 +49,7 @@ def source_hash(modules: Iterable[str]) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
+@functools.cache
 def _code_only(source: str) -> str:
     """The source without docstrings, comments, blank lines and trailing spaces.
 

@@ -9,6 +9,12 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 
 
+def pytest_collection_modifyitems(items) -> None:
+    """Tests of the site wait until it is built: others first; unit tests fill what is left."""
+    folders = {"site": 1, "unit": 2}
+    items.sort(key=lambda item: folders.get(item.path.parent.name, 0))
+
+
 @pytest.fixture(scope="session")
 def smoke_build(tmp_path_factory, worker_id) -> Path:
     """The folder with `_executed/smoke` and `_build/html`, made by the build itself.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import re
 from pathlib import Path
 
@@ -33,6 +34,7 @@ def draw_icons(pages: dict[str, BeautifulSoup], html: Path) -> None:
     (html / SCRIPT).unlink(missing_ok=True)
 
 
+@functools.cache
 def svg(name: str, library: str) -> str:
     """An icon of the solid style, which is the last one of each name in the library."""
     found = re.findall(ICON.format(name=re.escape(name)), library)

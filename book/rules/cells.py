@@ -52,7 +52,7 @@ class Cells:
     def runs(self, **where: Any) -> pd.Series:
         """Value of every run of a cell, or the mean of its values, indexed by run."""
         chosen = self.select(**where)
-        values = chosen.groupby("run")["value"].agg(lambda own: own.mean(skipna=False))
+        values = chosen.groupby("run")["value"].mean(skipna=False)
         if len(values) < self.num_runs or values.isna().any():
             cell = ", ".join(f"{column} {value}" for column, value in where.items())
             raise NoData(f"{cell}: {values.count()} of {self.num_runs} runs")
