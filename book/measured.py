@@ -12,7 +12,7 @@ from experiments.store import Store
 from rules.cells import Cells
 from rules.verdicts import compare
 
-FEWEST_RUNS = 10  # of an arm
+FEWEST_RUNS = 10  # of an arm, unless an entry says that it has fewer
 NO_BREAK = "\N{NO-BREAK SPACE}"
 
 
@@ -23,13 +23,15 @@ def difference(problem: dict, arms: dict) -> str:
         problem: ``where``, the columns of its rows; ``domains`` whose mean is taken; ``sign``, -1
             where less is better, and ``scale`` of the values; ``digits`` that are shown.
         arms: ``of`` and ``against``, the columns of the two; ``results``, in which they are;
-            ``where`` and ``domains``, if they are others than the problem's.
+            ``where`` and ``domains``, if they are others than the problem's; ``num_runs``, if an
+            arm has fewer than the others, which is then said.
     """
     ahead, behind = (values(problem, arms, arms[side]) for side in ("of", "against"))
     runs = ahead.index.intersection(behind.index)  # some arms have more
     sign, digits = problem["sign"] * problem["scale"], problem["digits"]
     mean, low, high, _ = compare(sign * ahead[runs], sign * behind[runs]).difference
-    text = f"{mean:+.{digits}f} [{low:+.{digits}f}, {high:+.{digits}f}]".replace("-", "−")
+    few = f" ({len(runs)} pairs)" if len(runs) < FEWEST_RUNS else ""
+    text = f"{mean:+.{digits}f} [{low:+.{digits}f}, {high:+.{digits}f}]{few}".replace("-", "−")
     return text.replace(" ", NO_BREAK)
 
 
@@ -41,7 +43,8 @@ def listed(problem: dict, entry: dict) -> list[str]:
 
 def values(problem: dict, arms: dict, arm: dict) -> pd.Series:
     """Of every run, the mean over the domains."""
-    cells = Cells(pd.concat(map(rows, arms["results"]), ignore_index=True), FEWEST_RUNS)
+    num_runs = arms.get("num_runs", FEWEST_RUNS)
+    cells = Cells(pd.concat(map(rows, arms["results"]), ignore_index=True), num_runs)
     where: dict[str, Any] = problem["where"] | arms.get("where", {}) | arm
     return cells.over(arms.get("domains", problem["domains"]), "mean", **where)
 

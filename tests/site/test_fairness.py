@@ -45,6 +45,16 @@ def test_a_difference_by_hand(by_hand):
     assert turned.startswith(f"−15.5{NO_BREAK}[−")
 
 
+def test_an_arm_with_few_runs_says_how_many(by_hand, monkeypatch):
+    rows = measured.rows("toy/rows")
+    monkeypatch.setattr(measured, "rows", lambda _: rows[rows["run"] < 3])
+    with pytest.raises(NoData, match="3 of 10 runs"):
+        measured.difference(PROBLEM, ARMS)
+    assert measured.difference(PROBLEM, ARMS | {"num_runs": 3}).endswith(
+        f"]{NO_BREAK}(3{NO_BREAK}pairs)"
+    )
+
+
 def test_an_arm_without_rows_has_no_difference(by_hand):
     with pytest.raises(NoData, match="method c: 0 of 10 runs"):
         measured.difference(PROBLEM, ARMS | {"of": {"method": "c"}})
