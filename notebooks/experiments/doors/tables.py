@@ -206,11 +206,14 @@ def controlled(
 
 
 def control_numbers(controlled: pd.DataFrame) -> dict[str, Any]:
-    """Difference and interval of every control, and the largest power of all."""
+    """Difference, interval and power of every control."""
+    columns = {"": "difference", "_interval": "95 %", "_power": "power"}
     rows = controlled.set_index("key")
-    numbers = {f"control_{arm}": rows.loc[arm, "difference"] for arm in rows.index}
-    intervals = {f"control_{arm}_interval": rows.loc[arm, "95 %"] for arm in rows.index}
-    return numbers | intervals | {"control_power": rows["power"].max()}
+    return {
+        f"control_{arm}{suffix}": rows.loc[arm, column]
+        for arm in rows.index
+        for suffix, column in columns.items()
+    }
 
 
 def gaps_of_draws(
