@@ -86,7 +86,8 @@ def test_pages_have_every_difference_and_name_what_is_not_measured():
 def interval(problem: str, aspect: str, name: str) -> tuple[float, float]:
     (entry,) = (own[problem] for own in PAGE["aspects"] if own["aspect"] == aspect)
     text = measured.difference(PAGE["problems"][problem], entry["measured"][name])
-    low, high = text.replace("−", "-").partition("[")[2].rstrip("]").split(f",{NO_BREAK}")
+    inside = text.replace("−", "-").partition("[")[2].partition("]")[0]
+    low, high = inside.split(f",{NO_BREAK}")
     return float(low), float(high)
 
 
