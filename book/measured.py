@@ -30,9 +30,9 @@ def difference(problem: dict, arms: dict) -> str:
     runs = ahead.index.intersection(behind.index)  # some arms have more
     sign, digits = problem["sign"] * problem["scale"], problem["digits"]
     mean, low, high, _ = compare(sign * ahead[runs], sign * behind[runs]).difference
+    text = f"{mean:+.{digits}f} [{low:+.{digits}f}, {high:+.{digits}f}]".replace("-", "−")
     few = f" ({len(runs)} pairs)" if len(runs) < FEWEST_RUNS else ""
-    text = f"{mean:+.{digits}f} [{low:+.{digits}f}, {high:+.{digits}f}]{few}".replace("-", "−")
-    return text.replace(" ", NO_BREAK)
+    return text.replace(" ", NO_BREAK) + few
 
 
 def listed(problem: dict, entry: dict) -> list[str]:

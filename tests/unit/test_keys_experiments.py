@@ -12,7 +12,7 @@ import torch
 from minigrid.core.constants import OBJECT_TO_IDX
 
 from experiments import keys as experiment
-from experiments import keys_in_full, keys_labels
+from experiments import keys_in_full, keys_labels, keys_tables
 from experiments.experiment import filled, plain, rebuilt
 from experiments.keys import (
     Cell,
@@ -600,7 +600,7 @@ def test_table_has_the_mean_and_deviation_over_runs_beside_the_papers():
     rows = made_up({("ppo", "red"): [0.25, 0.75], ("ipo", "red"): [1, 1], ("ppo", "grey"): [0]})
     names = {"ipo": "I", "ppo": "P"}
     paper = pd.DataFrame({"method": ["ipo"], "domain": ["red"], "text": ["0.9 ± 0.1"]})
-    table = experiment.table_by(rows, names, "return_exact", ["red"], paper)
+    table = keys_tables.table_by(rows, names, "return_exact", ["red"], paper)
     assert table.to_dict("list") == {
         "arm": ["I", "P"],
         "red": ["1.000 ± 0.000", "0.500 ± 0.250"],
@@ -611,13 +611,13 @@ def test_table_has_the_mean_and_deviation_over_runs_beside_the_papers():
 def test_comparison_on_grey_by_hand():
     ours, theirs = [0.5, 0.75, 1.0], [0.25, 0.5, 0.75]  # run by run 0.25 more
     rows = made_up({("ipo", "grey"): ours, ("ppo", "grey"): theirs})
-    (row,) = experiment.comparison(rows, [("ipo", "ppo")]).to_dict("records")
+    (row,) = keys_tables.comparison(rows, [("ipo", "ppo")]).to_dict("records")
     assert row["difference on grey"] == "IPO, as published − PPO, as published"
     assert row["mean"] == 0.25 and row["95 % interval"] == "[+0.250, +0.250]"
     assert row["P(improvement)"] == pytest.approx((6 + 2 / 2) / 9)  # of nine pairs two are equal
     assert row["p"] == 0.0
-    assert experiment.gap(rows, "ipo", "ppo") == "+0.250 [+0.250, +0.250]"
-    assert experiment.gap(rows, "ppo", "ipo").startswith("-0.250")
+    assert keys_tables.gap(rows, "ipo", "ppo") == "+0.250 [+0.250, +0.250]"
+    assert keys_tables.gap(rows, "ppo", "ipo").startswith("-0.250")
 
 
 def test_draws_are_of_the_published_protocol_and_of_each_methods_own_runs():
@@ -628,7 +628,7 @@ def test_draws_are_of_the_published_protocol_and_of_each_methods_own_runs():
             made_up({key: [-1.0] * 5 for key in values}),
         ]
     )
-    drawn = experiment.draws_of_ten(rows, np.random.default_rng(0), num_draws=20_000)
+    drawn = keys_tables.draws_of_ten(rows, np.random.default_rng(0), num_draws=20_000)
     assert drawn["ipo"].shape == drawn["ppo"].shape == (20_000, 10)
     assert set(drawn["ipo"].flat) == {1, 3} and set(drawn["ppo"].flat) == {10, 20, 60}
     for method, runs in (("ipo", [1, 3]), ("ppo", [10, 20, 60])):
@@ -642,7 +642,7 @@ def test_runs_needed_have_the_stated_power():
     values = rng.normal(size=(2, 1000))
     values = (values - values.mean(1, keepdims=True)) / values.std(1, ddof=1, keepdims=True)
     rows = made_up({("ipo", "grey"): 2 * values[0], ("ppo", "grey"): 0.5 * values[1]})
-    needed = experiment.runs_needed(rows, 0.5)
+    needed = keys_tables.runs_needed(rows, 0.5)
     one, other = rng.normal(0.5, 2, (4000, needed)), rng.normal(0, 0.5, (4000, needed))
     found = scipy.stats.ttest_ind(one, other, axis=1, equal_var=False).pvalue < 0.05
     assert found.mean() == pytest.approx(0.8, abs=0.03)
@@ -654,7 +654,7 @@ def test_computed_rows_stand_beside_the_shipped_ones_of_the_same_run():
     both = beside_shipped(again, shipped).sort_values("run")
     assert both["run"].tolist() == [0, 1] and both["shipped"].tolist() == [0.1, 0.2]
     assert both["difference"].tolist() == pytest.approx([0, 0.05])
-    (row,) = experiment.by_update(both).to_dict("records")
+    (row,) = keys_tables.by_update(both).to_dict("records")
     assert (row.pop("arm"), row.pop("frames")) == ("PPO, as published", 64)
     means = {"red, shipped": 0.15, "red, live": 0.175, "largest difference": 0.05}
     assert row == pytest.approx(means)
@@ -663,7 +663,7 @@ def test_computed_rows_stand_beside_the_shipped_ones_of_the_same_run():
 
 
 def test_encodings_keep_the_arms_of_each_network_apart(shipped):
-    panels = experiment.encodings(shipped["main"], shipped["variants"])
+    panels = keys_tables.encodings(shipped["main"], shipped["variants"])
     variants = shipped["variants"]
     titles = [title for title, *_ in panels.values()]
     assert titles[1:3] == ["integer, red and yellow", "one-hot, red and green"]
@@ -699,7 +699,7 @@ def test_frames_of_the_algorithm_in_full_are_counted_as_training_counts_them(tab
 
 
 def test_steps_of_the_task_follow_one_another(shipped):
-    steps = experiment.subtasks(shipped["main"], "red")
+    steps = keys_tables.subtasks(shipped["main"], "red")
     assert list(steps.index) == [(arm, c) for arm in experiment.MAIN for c in ("red", "grey")]
     assert list(steps.columns) == ["holds the key", "unlocks the door", "reaches the goal"]
     expected = runs_of(shipped["main"], "ipo", "grey", "unlocks_door").mean()
@@ -719,7 +719,7 @@ def test_returns_are_those_of_the_exact_metrics(trained):
 
 def test_a_policy_sees_grey_keys_and_walls_as_they_are_in_code_5(trained):
     task, players = trained
-    rows = experiment.beyond_codes(task, {"ipo": players}, walls=[2, 5], codes=[0, 5])
+    rows = keys_tables.beyond_codes(task, {"ipo": players}, walls=[2, 5], codes=[0, 5])
     assert len(rows) == 2 * 2 * 2 and set(rows["method"]) == {"ipo"}
     grey = returns(task, players)["grey", "return_exact"]
     seen = rows.set_index(["wall", "code", "run"])["value"]
@@ -733,7 +733,7 @@ def test_a_policy_sees_grey_keys_and_walls_as_they_are_in_code_5(trained):
 
 def test_temperatures_lead_from_the_best_action_to_the_policy_to_chance(trained):
     task, players = trained
-    rows = experiment.by_temperature(task, {"ipo": players}, ["green"], [0.0, 1.0, 1e9])
+    rows = keys_tables.by_temperature(task, {"ipo": players}, ["green"], [0.0, 1.0, 1e9])
     found = rows.set_index(["temperature", "run"])["value"]
     metrics, table = exact(task, players), task.tasks["green"]
     assert found[0.0].tolist() == metrics["green", "return_greedy"].tolist()
@@ -744,7 +744,7 @@ def test_temperatures_lead_from_the_best_action_to_the_policy_to_chance(trained)
 
 def test_visits_count_every_step_in_the_cell_where_it_is_spent(trained):
     task, players = trained
-    spent = experiment.visits(task, players, "red")
+    spent = keys_tables.visits(task, players, "red")
     table = task.tasks["red"]
     assert spent.shape == (3, 5, 5)
     assert (spent[:, [0, -1], :] == 0).all() and (spent[:, :, [0, -1]] == 0).all()
