@@ -1,8 +1,8 @@
 """The worlds that policies act in.
 
 ``colored_keys`` (MiniGrid), and ``tabular``, which turns them into tables; ``cued_maze``, which is
-one, and ``networks`` for tables; ``door`` (MuJoCo), and ``many_doors`` side by side. Each brings
-its packages as an extra: ``ipo[keys,door]``.
+one, and ``networks`` for tables; ``door`` (MuJoCo), ``many_doors`` side by side, and ``one_door``.
+Each brings its packages as an extra: ``ipo[keys,door]``.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from importlib import import_module
 from typing import Any
 
 # What is registered with gymnasium: module, and the extra with the packages that it needs.
-ENVIRONMENTS = {"ColoredKeysEnv": ("colored_keys", "keys"), "DoorEnv": ("door", "door")}
+ENVIRONMENTS = {"ColoredKeysEnv": ("colored_keys", "keys"), "DoorEnv": ("one_door", "door")}
 
 
 def __getattr__(name: str) -> Any:

@@ -11,14 +11,13 @@ The state is that of 7 joints: the wrist's x, y, z, its angles about z, y and x,
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
-from typing import Annotated, Any, ClassVar, Protocol
+from dataclasses import dataclass, field, fields
+from typing import Annotated, Any
 
-import gymnasium as gym
 import mujoco
 import numpy as np
 
-from ipo.checks import Count, Positive, Seed, check_number, checked
+from ipo.checks import Positive, check_number, checked
 
 TIMESTEP, NUM_SUBSTEPS = 0.004, 5  # 50 actions a second; the published runs simulate 0.001 x 20
 MAX_STEPS = 512  # an episode lasts 10.24 s
@@ -48,6 +47,20 @@ START_LOW = np.array([-0.3] * 5 + [0.0] + [-0.10, -0.15])
 START_HIGH = np.array([0.3] * 5 + [3.13] + [0.15, 0.0])
 
 Shift = Annotated[Sequence[float] | np.ndarray, "2"]  # of a handle along y and z, in m
+Draw = Callable[[np.random.Generator], float]
+
+
+def _size(default: float, limits: tuple[float, float], draw: Draw | None = None) -> Any:
+    """A field of :class:`DoorParams`: its default, its bounds, and how a random door draws it."""
+    return field(default=default, metadata={"limits": limits, "draw": draw})
+
+
+def _grid(low: int, high: int, unit: float) -> Draw:
+    return lambda generator: round(int(generator.integers(low, high)) * unit, 6)
+
+
+def _uniform(low: float, high: float) -> Draw:
+    return lambda generator: float(generator.uniform(low, high))
 
 
 @dataclass(frozen=True)
@@ -72,44 +85,26 @@ class DoorParams:
         handle_fillet: radius of the bend between bar and standoff, in m.
     """
 
-    friction: float = 0.0
-    height: float = 2.25
-    width: float = 0.975
-    thickness: float = 0.025
-    handle_height: float = 1.0
-    handle_ratio: float = 0.15
-    wall_offset: float = 0.0
-    density: float = 250.0
-    hinge_damping: float = 1.5
-    hinge_stiffness: float = 0.15
-    joint_damping: float = 0.095
-    handle_diameter: float = 0.016
-    handle_depth: float = 0.095
-    handle_half_length: float = 0.0875
-    handle_fillet: float = 0.02
-
-    LIMITS: ClassVar[dict[str, tuple[float, float]]] = {
-        "friction": (0.0, 100.0),
-        "height": (1.2, 4.0),
-        "width": (0.3, 3.0),
-        "thickness": (0.005, 0.2),
-        "handle_height": (0.3, 2.0),
-        "handle_ratio": (0.01, 0.5),
-        "wall_offset": (-1.0, 1.0),
-        "density": (10.0, 10_000.0),
-        "hinge_damping": (0.0, 100.0),
-        "hinge_stiffness": (0.0, 100.0),
-        "joint_damping": (0.0, 10.0),
-        "handle_diameter": (0.005, 0.04),
-        "handle_depth": (0.04, 0.3),
-        "handle_half_length": (0.05, 0.3),
-        "handle_fillet": (0.002, 0.1),
-    }
+    friction: float = _size(0.0, (0.0, 100.0))
+    height: float = _size(2.25, (1.2, 4.0), _grid(2000, 2500, 0.001))
+    width: float = _size(0.975, (0.3, 3.0), _grid(750, 1200, 0.001))
+    thickness: float = _size(0.025, (0.005, 0.2), _grid(20, 30, 0.001))
+    handle_height: float = _size(1.0, (0.3, 2.0), _grid(900, 1100, 0.001))
+    handle_ratio: float = _size(0.15, (0.01, 0.5), _grid(10, 20, 0.01))
+    wall_offset: float = _size(0.0, (-1.0, 1.0), _grid(-100, 100, 0.001))
+    density: float = _size(250.0, (10.0, 10_000.0), _grid(200, 300, 1.0))
+    hinge_damping: float = _size(1.5, (0.0, 100.0), _grid(10, 20, 0.1))
+    hinge_stiffness: float = _size(0.15, (0.0, 100.0), _grid(10, 20, 0.01))
+    joint_damping: float = _size(0.095, (0.0, 10.0), _grid(9, 11, 0.01))
+    handle_diameter: float = _size(0.016, (0.005, 0.04), _uniform(0.012, 0.020))
+    handle_depth: float = _size(0.095, (0.04, 0.3), _uniform(0.070, 0.120))
+    handle_half_length: float = _size(0.0875, (0.05, 0.3), _uniform(0.075, 0.100))
+    handle_fillet: float = _size(0.02, (0.002, 0.1), _uniform(0.008, 0.035))
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            low, high = self.LIMITS[field.name]
-            check_number(field.name, getattr(self, field.name), least=low, most=high)
+        for size in fields(self):
+            low, high = size.metadata["limits"]
+            check_number(size.name, getattr(self, size.name), least=low, most=high)
         for name in ("handle_depth", "handle_half_length"):
             if self.handle_fillet >= getattr(self, name):
                 raise ValueError(
@@ -123,32 +118,12 @@ class DoorParams:
         """A random door, which but for its friction does not depend on the friction.
 
         On DoorGym's grids: millimetres, whole kg / m^3, and tenths or hundredths of the others.
-        The handle's four sizes are uniform over what five measured handles span.
+        The handle's four sizes are uniform over what five measured handles span. The draws follow
+        the order of the fields.
         """
-
-        def grid(low: int, high: int, unit: float) -> float:
-            return round(int(generator.integers(low, high)) * unit, 6)
-
-        def uniform(low: float, high: float) -> float:
-            return float(generator.uniform(low, high))
-
-        return cls(
-            friction=friction,
-            height=grid(2000, 2500, 0.001),
-            width=grid(750, 1200, 0.001),
-            thickness=grid(20, 30, 0.001),
-            handle_height=grid(900, 1100, 0.001),
-            handle_ratio=grid(10, 20, 0.01),
-            wall_offset=grid(-100, 100, 0.001),
-            density=float(grid(200, 300, 1)),
-            hinge_damping=grid(10, 20, 0.1),
-            hinge_stiffness=grid(10, 20, 0.01),
-            joint_damping=grid(9, 11, 0.01),
-            handle_diameter=uniform(0.012, 0.020),
-            handle_depth=uniform(0.070, 0.120),
-            handle_half_length=uniform(0.075, 0.100),
-            handle_fillet=uniform(0.008, 0.035),
-        )
+        draws = {size.name: size.metadata["draw"] for size in fields(cls)}
+        drawn = {name: draw(generator) for name, draw in draws.items() if draw is not None}
+        return cls(friction=friction, **drawn)
 
     @property
     def lever_arm(self) -> float:
@@ -182,6 +157,18 @@ class DoorParams:
         F = self.handle_fillet
         rho = 0.97450 * (F + radius**2 / (4 * F))
         return np.array([self.handle_depth - F + rho * np.sin(np.pi / 8), 0.0, 0.0])
+
+
+@checked
+def substeps(timestep: Positive) -> int:
+    """How many steps of the simulation an action lasts."""
+    number = round(TIMESTEP * NUM_SUBSTEPS / timestep)
+    if number < 1 or abs(number * timestep - TIMESTEP * NUM_SUBSTEPS) > 1e-9:
+        raise ValueError(
+            f"timestep = {timestep!r}: a whole number of them must make "
+            f"{TIMESTEP * NUM_SUBSTEPS} s, the time of an action"
+        )
+    return number
 
 
 @checked
@@ -382,163 +369,3 @@ def draw_start(generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
 def shift_handle(model: mujoco.MjModel, params: DoorParams, handle_shift: Shift) -> None:
     """Put a compiled door's handle in its place for an episode."""
     model.body("handle").pos = params.handle_position + np.array([0.0, *handle_shift])
-
-
-# --------------------------------------------------------------------------------- environment
-
-
-class Picture(Protocol):
-    """What draws a door; how it looks is no business of the simulation."""
-
-    def frame(self, qpos: np.ndarray, handle_shift: np.ndarray) -> np.ndarray:
-        """A picture ``[height, width, 3]`` of the joints ``[7]``."""
-
-    def close(self) -> None: ...
-
-
-class DoorEnv(gym.Env):
-    """One door, which stays the same until ``reset`` is given a seed. ``ipo/Door-v0``.
-
-    An episode ends at the time limit only: after ``max_steps`` steps ``truncated`` is true. The
-    reward of a step is that of the state in which the action was chosen.
-
-    ``info["door_angle"]`` is in radians; ``info["opened"]`` says whether the door was ever
-    0.2 open in this episode.
-
-    Args:
-        friction: of the hinge, in N m: the domain.
-        params: the door; without it, a random one is drawn at the first reset and at every reset
-            with a seed. The seed also decides how episodes begin.
-        max_steps: T.
-        timestep: in s; an action lasts for 0.02 s, whatever it is.
-        render_mode: ``rgb_array`` or none.
-        draw: from a door to what makes its pictures; ``rgb_array`` needs it.
-
-    Raises:
-        TypeError, ValueError: a friction, a door or a horizon that makes no sense, friction and
-            ``params`` together, ``rgb_array`` without ``draw``, actions that are not finite.
-        FloatingPointError: a simulation that diverges.
-    """
-
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 50}  # noqa: RUF012  (as gymnasium)
-
-    @checked
-    def __init__(
-        self,
-        friction: float | None = None,
-        params: DoorParams | None = None,
-        max_steps: Count = MAX_STEPS,
-        timestep: Positive = TIMESTEP,
-        render_mode: str | None = None,
-        draw: Callable[[DoorParams], Picture] | None = None,
-    ) -> None:
-        if friction is not None and params is not None:
-            raise ValueError(f"friction = {friction!r}: must not be given beside params")
-        if render_mode not in (None, "rgb_array"):
-            raise ValueError(f"render_mode = {render_mode!r}: must be 'rgb_array' or None")
-        if render_mode is not None and draw is None:
-            raise ValueError(f"render_mode = {render_mode!r}: must come with draw")
-        self.friction = DoorParams(friction=0.0 if friction is None else friction).friction
-        self.given, self.max_steps = params, max_steps
-        self.render_mode, self.draw = render_mode, draw
-        self.timestep, self.num_substeps = timestep, substeps(timestep)
-        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (15,), np.float64)
-        self.action_space = gym.spaces.Box(-1.0, 1.0, (6,), np.float32)
-        self.params: DoorParams | None = None
-        self.step_count = 0
-        self._picture: Picture | None = None
-
-    @checked
-    def reset(
-        self, *, seed: Seed | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[np.ndarray, dict[str, Any]]:
-        super().reset(seed=seed)
-        params = self.params
-        if params is None or (seed is not None and self.given is None):
-            params = self.given or DoorParams.sample(self.np_random, self.friction)
-            self.params = params
-            self.model = build_door(params, self.timestep).compile()
-            self.data = mujoco.MjData(self.model)
-            self.close()
-        qpos, self.handle_shift = draw_start(self.np_random)
-        shift_handle(self.model, params, self.handle_shift)
-        self.hinge, self.arm = lever(params, self.handle_shift)
-        mujoco.mj_resetData(self.model, self.data)
-        self.data.qpos[:] = qpos
-        self.step_count, self.opened = 0, False
-        observation, self.next_reward = self._observe()
-        return observation, self._info()
-
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        if self.params is None:
-            raise gym.error.ResetNeeded("reset() must come before step()")
-        if self.step_count >= self.max_steps:
-            raise gym.error.ResetNeeded("the episode has ended: reset() must come before step()")
-        self.data.ctrl[:] = check_actions(np.asarray(action)[None], self.step_count)[0]
-        mujoco.mj_step(self.model, self.data, self.num_substeps)
-        self.step_count += 1
-        check_states(self.data.qpos[None], self.data.qvel[None], self.step_count)
-        earned = self.next_reward
-        observation, self.next_reward = self._observe()
-        self.opened = self.opened or abs(self.data.qpos[6]) >= OPENED
-        truncated = self.step_count >= self.max_steps
-        return observation, float(earned), False, truncated, self._info()
-
-    def render(self) -> np.ndarray | None:
-        """A picture of the present state; none without a ``render_mode``."""
-        if self.draw is None or self.render_mode is None:
-            return None
-        if self.params is None:
-            raise gym.error.ResetNeeded("reset() must come before render()")
-        if self._picture is None:
-            self._picture = self.draw(self.params)
-        return self._picture.frame(self.data.qpos, self.handle_shift)
-
-    def close(self) -> None:
-        if self._picture is not None:
-            self._picture.close()
-            self._picture = None
-
-    def _observe(self) -> tuple[np.ndarray, np.ndarray]:
-        return observe(self.data.qpos, self.data.qvel, self.hinge, self.arm)
-
-    def _info(self) -> dict[str, Any]:
-        return {"door_angle": float(self.data.qpos[6]), "opened": bool(self.opened)}
-
-
-@checked
-def substeps(timestep: Positive) -> int:
-    """How many steps of the simulation an action lasts."""
-    number = round(TIMESTEP * NUM_SUBSTEPS / timestep)
-    if number < 1 or abs(number * timestep - TIMESTEP * NUM_SUBSTEPS) > 1e-9:
-        raise ValueError(
-            f"timestep = {timestep!r}: a whole number of them must make "
-            f"{TIMESTEP * NUM_SUBSTEPS} s, the time of an action"
-        )
-    return number
-
-
-def check_actions(actions: np.ndarray, step: int) -> np.ndarray:
-    """Actions ``[N, 6]`` in double precision; refuses those that are not finite numbers."""
-    if actions.shape[1:] != (6,):
-        raise ValueError(f"action: has shape {actions.shape[1:]}, must have (6,)")
-    if actions.dtype.kind not in "fiu":
-        raise TypeError(f"action: holds {actions.dtype}, must hold real numbers")
-    finite = np.isfinite(actions).all(1)
-    if not finite.all():
-        door = int(np.flatnonzero(~finite)[0])
-        raise ValueError(
-            f"action = {actions[door].tolist()} of door {door} in step {step}: must be finite"
-        )
-    return actions.astype(np.float64, copy=False)
-
-
-def check_states(qpos: np.ndarray, qvel: np.ndarray, step: int) -> None:
-    """Raise FloatingPointError where a simulation, ``[N, 7]``, has diverged."""
-    if not (np.abs(qpos).max() < 1e3 and np.abs(qvel).max() < 1e6):  # so it is for NaN
-        sound = (np.abs(qpos) < 1e3).all(1) & (np.abs(qvel) < 1e6).all(1)
-        door = int(np.flatnonzero(~sound)[0])
-        raise FloatingPointError(
-            f"the simulation of door {door} diverged in step {step}: "
-            f"joints at {qpos[door].tolist()}"
-        )

@@ -22,8 +22,6 @@ from ipo.worlds.door import (
     TIMESTEP,
     DoorParams,
     build_door,
-    check_actions,
-    check_states,
     draw_start,
     lever,
     observe,
@@ -44,7 +42,7 @@ class VectorDoor(gym.vector.VectorEnv):
 
     Args:
         doors: for each door its friction, then the door is drawn from its seed; or its parameters.
-        max_steps, timestep: see :class:`ipo.worlds.door.DoorEnv`.
+        max_steps, timestep: see :class:`ipo.worlds.one_door.DoorEnv`.
 
     Raises:
         TypeError, ValueError: no doors, a friction or a number that makes no sense, actions of
@@ -64,10 +62,8 @@ class VectorDoor(gym.vector.VectorEnv):
         self.given = list(doors)
         self.num_envs, self.max_steps = len(self.given), max_steps
         self.timestep, self.num_substeps = timestep, substeps(timestep)
-        self.frictions = [
-            (door if isinstance(door, DoorParams) else DoorParams(friction=door)).friction
-            for door in self.given
-        ]
+        given = [d if isinstance(d, DoorParams) else DoorParams(friction=d) for d in self.given]
+        self.frictions = [door.friction for door in given]
         self.single_observation_space = gym.spaces.Box(-np.inf, np.inf, (15,), np.float64)
         self.single_action_space = gym.spaces.Box(-1.0, 1.0, (6,), np.float32)
         batch_space = gym.vector.utils.batch_space
@@ -101,12 +97,7 @@ class VectorDoor(gym.vector.VectorEnv):
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """One step of every door, and a new beginning after the last one of the episodes."""
         self._check_reset("step()")
-        actions = np.asarray(actions)
-        if actions.shape != self.action_space.shape:
-            raise ValueError(
-                f"actions: have shape {actions.shape}, must have {self.action_space.shape}"
-            )
-        actions = check_actions(actions, self.step_count)
+        actions = self._checked(np.asarray(actions))
         rewards = self.next_rewards
         for model, data, ctrl, action in zip(
             self.models, self.data, self.ctrl, actions, strict=True
@@ -208,6 +199,31 @@ class VectorDoor(gym.vector.VectorEnv):
     def _observe(self) -> tuple[np.ndarray, np.ndarray]:
         """Observations ``[N, 15]`` and door angles ``[N]``; notes the rewards of the next step."""
         qpos, qvel = np.array(self.qpos), np.array(self.qvel)
-        check_states(qpos, qvel, self.step_count)
+        self._check_states(qpos, qvel)
         observations, self.next_rewards = observe(qpos, qvel, self.hinges, self.arms)
         return observations, qpos[:, 6].copy()
+
+    def _checked(self, actions: np.ndarray) -> np.ndarray:
+        """Actions ``[N, 6]`` in double precision; refuses those that are not finite numbers."""
+        if actions.shape != (self.num_envs, 6):
+            raise ValueError(f"actions: have shape {actions.shape}, must have {self.num_envs, 6}")
+        if actions.dtype.kind not in "fiu":
+            raise TypeError(f"action: holds {actions.dtype}, must hold real numbers")
+        finite = np.isfinite(actions).all(1)
+        if not finite.all():
+            door = int(np.flatnonzero(~finite)[0])
+            raise ValueError(
+                f"action = {actions[door].tolist()} of door {door} in step {self.step_count}: "
+                "must be finite"
+            )
+        return actions.astype(np.float64, copy=False)
+
+    def _check_states(self, qpos: np.ndarray, qvel: np.ndarray) -> None:
+        """Raise FloatingPointError where a simulation, ``[N, 7]``, has diverged."""
+        if not (np.abs(qpos).max() < 1e3 and np.abs(qvel).max() < 1e6):  # so it is for NaN
+            sound = (np.abs(qpos) < 1e3).all(1) & (np.abs(qvel) < 1e6).all(1)
+            door = int(np.flatnonzero(~sound)[0])
+            raise FloatingPointError(
+                f"the simulation of door {door} diverged in step {self.step_count}: "
+                f"joints at {qpos[door].tolist()}"
+            )

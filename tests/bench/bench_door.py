@@ -22,8 +22,8 @@ from tqdm import tqdm
 
 from experiments.doors.training import NETWORK, new_training, published_door
 from experiments.sealed import write_record
-from ipo.worlds.door import DoorEnv
 from ipo.worlds.many_doors import VectorDoor
+from ipo.worlds.one_door import DoorEnv
 
 FRICTIONS = [0.0] * 24 + [0.1] * 8
 UPDATES = 190  # of 131,072 steps each: 25 million

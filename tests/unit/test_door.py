@@ -16,7 +16,6 @@ from ipo.worlds.door import (
     ANCHOR,
     FINGERTIP,
     WRIST,
-    DoorEnv,
     DoorParams,
     build_door,
     draw_start,
@@ -29,6 +28,7 @@ from ipo.worlds.door import (
     target_position,
 )
 from ipo.worlds.many_doors import VectorDoor
+from ipo.worlds.one_door import DoorEnv
 
 NAN = math.nan
 

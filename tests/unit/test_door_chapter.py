@@ -26,7 +26,7 @@ from experiments.doors.arms import (
 from experiments.doors.success import door_seeds, evaluation_doors
 from experiments.doors.training import NETWORK, made_for, policy_path
 from experiments.policies import save_policy
-from ipo.worlds.door import DoorEnv
+from ipo.worlds.one_door import DoorEnv
 
 FRICTIONS = (1.1, 1.5)
 NUM_DOORS = 4

@@ -25,8 +25,8 @@ from experiments.doors.training import (
 )
 from experiments.policies import save_policy
 from ipo.networks import DenseNetwork
-from ipo.worlds.door import DoorEnv
 from ipo.worlds.many_doors import VectorDoor
+from ipo.worlds.one_door import DoorEnv
 
 
 @pytest.fixture

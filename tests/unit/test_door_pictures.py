@@ -13,7 +13,8 @@ from gymnasium.utils.env_checker import check_env
 import ipo  # noqa: F401  (registers the environments)
 from experiments.doors.hooking import Hooking
 from experiments.pictures import DoorPicture, RenderError, door_scene
-from ipo.worlds.door import DoorEnv, DoorParams, build_door
+from ipo.worlds.door import DoorParams, build_door
+from ipo.worlds.one_door import DoorEnv
 
 SHIFT = np.array([0.05, -0.05])
 
@@ -95,7 +96,7 @@ def test_without_egl_the_message_names_the_packages_and_doors_still_work():
     code = (
         "import os; os.environ['PYOPENGL_PLATFORM'] = 'none'\n"
         "import numpy as np\n"
-        "from ipo.worlds.door import DoorEnv\n"
+        "from ipo.worlds.one_door import DoorEnv\n"
         "from experiments.pictures import DoorPicture, RenderError\n"
         "env = DoorEnv(render_mode='rgb_array', draw=DoorPicture)\n"
         "env.reset(seed=0); env.step(np.zeros(6))\n"

@@ -16,7 +16,8 @@ from experiments.doors.pulling import (
 from experiments.doors.success import Cell, ScriptedCell, watch
 from experiments.doors.training import CELLS, NETWORK, last_info, made_for, policy_path
 from experiments.policies import save_policy
-from ipo.worlds.door import DoorEnv, DoorParams
+from ipo.worlds.door import DoorParams
+from ipo.worlds.one_door import DoorEnv
 
 
 def scripted(side: str, seed: int) -> str:

@@ -23,7 +23,8 @@ from experiments.doors.success import (
 )
 from experiments.doors.training import CURVE_FRICTION, TRAIN_FRICTIONS
 from experiments.doors.ways import STRATEGIES, TRAITS, success_by_lever, trait_correlations
-from ipo.worlds.door import GEAR, DoorEnv
+from ipo.worlds.door import GEAR
+from ipo.worlds.one_door import DoorEnv
 
 
 def color(cell: Cell) -> str:

@@ -13,7 +13,8 @@ import mujoco
 import numpy as np
 
 from ipo.checks import Probability, checked
-from ipo.worlds.door import FINGER, TUBES, DoorEnv
+from ipo.worlds.door import FINGER, TUBES
+from ipo.worlds.one_door import DoorEnv
 
 # Where the inside of the hook lies, seen from a tube's axis, in the wrist's frame. The hook hangs
 # on the wrist, which is at +x, and its mouth is at -y.

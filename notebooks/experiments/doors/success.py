@@ -31,7 +31,8 @@ from experiments.experiment import Experiment
 from ipo.checks import Count, Natural, NonNegative, check_choice, check_count, checked
 from ipo.distributions import Gaussian
 from ipo.networks import Weights
-from ipo.worlds.door import DoorEnv, DoorParams
+from ipo.worlds.door import DoorParams
+from ipo.worlds.one_door import DoorEnv
 
 TEST_FRICTIONS = (1.1, 1.2, 1.3, 1.4, 1.5)  # of the paper's Table 4
 NUM_DOORS = 200

@@ -16,7 +16,8 @@ from experiments.doors.arms import NAMES, PUBLISHED, of_arm
 from experiments.doors.figures import play
 from experiments.doors.success import Cell, door_seeds, load_players, most_likely
 from experiments.doors.ways import LEVER_BINS
-from ipo.worlds.door import GEAR, MAX_STEPS, DoorEnv
+from ipo.worlds.door import GEAR, MAX_STEPS
+from ipo.worlds.one_door import DoorEnv
 
 NUM_RUNS = 3  # the first ones of both arms, whatever came out
 
