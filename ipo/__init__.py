@@ -10,15 +10,16 @@ An evening's reading, in this order:
     networks        policies and critics, and the average of several players' outputs
     rollouts        experience in many environments at once, and advantages
     ppo             PPO, IPO and the ensemble: that game between networks
-    stats           intervals and comparisons over runs
-    checks          errors that name the parameter, its value and the rule
 
 Then, as you need them:
 
     own_domains     the same for environments of your own
-    notebooks       misspelt parameters of a notebook
+    stats           intervals and comparisons over runs
     causality       causal models, invariant predictors, IRM-Games, ICP, games of two numbers
     worlds          coloured keys, a maze, doors, and networks for tables of what is seen
+    dense_in_numpy  a network again, written out for speed
+    checks          errors that name the parameter, its value and the rule
+    notebooks       misspelt parameters of a notebook
 
 Import what you need (``from ipo import lqr``); nothing heavy is imported here. The environments
 are registered with gymnasium: ``gymnasium.make("ipo/ColoredKeys-v0", color="grey")``.

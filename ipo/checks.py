@@ -9,6 +9,10 @@ What is ``checked`` applies the rules of its signature before it does anything; 
 of its fields. In a call a letter of a shape means the same size everywhere; the attribute ``sizes``
 of an object gives letters, too. What every step of a training calls is not checked: its arrays come
 from what was.
+
+Libraries for this were tried: pydantic refuses NumPy's whole numbers and does not see shapes,
+beartype with jaxtyping takes True for a number and refuses 1 for 1.0, and neither sees NaN in a
+tensor or one seed named twice.
 """
 
 from __future__ import annotations

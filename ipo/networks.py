@@ -28,7 +28,6 @@ Weights = dict[str, Tensor]
 Outputs = tuple[Tensor, Tensor]
 Acting = Callable[[Tensor], Outputs]  # what is done where observations are seen
 PullBack = Callable[[Tensor, Tensor], list[Tensor]]  # slopes in the outputs -> in the weights
-Layers = list[tuple[np.ndarray, np.ndarray]]  # matrices [R, inputs, units], biases [R, 1, units]
 
 
 class Network(ABC):
@@ -73,7 +72,15 @@ class Network(ABC):
         It is the vector-Jacobian product: slopes of the shapes of parameters and values -> one
         ``[R, ...]`` for each of the weights, in their order. Nothing else has a gradient.
         """
-        return vjp(self, weights, observations)
+        leaves = {name: w.detach().requires_grad_() for name, w in weights.items()}
+        with torch.enable_grad():
+            outputs = self(leaves, observations)
+
+        def pull_back(of_parameters: Tensor, of_values: Tensor) -> list[Tensor]:
+            slopes = (of_parameters, of_values)
+            return list(torch.autograd.grad(outputs, list(leaves.values()), slopes))
+
+        return (outputs[0].detach(), outputs[1].detach()), pull_back
 
     @checked
     def _check(self, players: Annotated[Sequence[Weights], "E"]) -> None:
@@ -94,7 +101,7 @@ class DenseNetwork(Network):
     With the default sizes it is the network of the paper's door-opening runs. Weights start as
     orthogonal matrices times sqrt(2), those of the actor's last layer times 1; biases start at 0.
     The standard deviations of a Gaussian do not depend on the observation: their logarithms are
-    weights, which start at 0.
+    weights, which start at 0. :class:`ipo.dense_in_numpy.DenseInNumpy` is the same, but faster.
 
     Args:
         num_observations: length of an observation.
@@ -149,71 +156,6 @@ class DenseNetwork(Network):
             parameters = torch.cat([parameters, deviation.expand_as(parameters)], -1)
         return parameters, values
 
-    def vjp(self, weights: Weights, observations: Tensor) -> tuple[Outputs, PullBack]:
-        """By hand, in NumPy on the CPU: for small minibatches torch would take twice as long."""
-        if observations.device.type != "cpu":
-            return super().vjp(weights, observations)
-        layers = [self._layers(weights, part) for part in self.layers]
-        seen = [inputs_and_output(own, observations.numpy()) for own in layers]
-        (*_, parameters), (*_, values) = seen
-        deviation = None
-        if self.distribution is Gaussian:
-            deviation = np.exp(weights["log_std"].numpy())
-            parameters = _with_deviation(parameters, deviation)
-
-        def pull_back(of_parameters: Tensor, of_values: Tensor) -> list[Tensor]:
-            of_actor = of_parameters.numpy()[..., : self.num_actions]
-            slopes = (of_actor, of_values.unsqueeze(-1).numpy())
-            found = [
-                slopes_of_layers(own, x, y) for own, x, y in zip(layers, seen, slopes, strict=True)
-            ]
-            named = {
-                f"{layer}.{kind}": slope
-                for part, own in zip(self.layers.values(), found, strict=True)
-                for layer, pair in zip(part, own, strict=True)
-                for kind, slope in zip(("weight", "bias"), pair, strict=True)
-            }
-            if deviation is not None:
-                of_deviation = of_parameters.numpy()[..., self.num_actions :]
-                named["log_std"] = deviation * of_deviation.sum(1)
-            return [torch.from_numpy(named[name]) for name in weights]
-
-        return (torch.from_numpy(parameters), torch.from_numpy(values[..., 0])), pull_back
-
-    def _layers(self, weights: Weights, part: str) -> Layers:
-        """Views of the weights of the ``actor`` or the ``critic``."""
-        return [
-            (weights[f"{name}.weight"].numpy(), weights[f"{name}.bias"].numpy()[:, None])
-            for name in self.layers[part]
-        ]
-
-    def frozen(self, players: Sequence[Weights]) -> Acting:
-        """The average that acts, as a function of ``observations [R, B, O]``.
-
-        In NumPy on the CPU: for the few rows of a step, torch would take five times as long.
-        """
-        self._check(players)
-        if next(iter(players[0].values())).device.type != "cpu":
-            return super().frozen(players)
-        players = copied(players)
-        actors, critics = ([self._layers(own, part) for own in players] for part in self.layers)
-        deviation = None
-        if self.distribution is Gaussian:
-            deviation = np.mean([own["log_std"].exp().numpy() for own in players], 0)
-
-        def outputs(parts: list[Layers], x: np.ndarray) -> np.ndarray:
-            each = [inputs_and_output(own, x)[-1] for own in parts]
-            return np.sum(each, 0) / len(each)
-
-        def policy(observations: Tensor) -> Outputs:
-            x = observations.numpy()
-            parameters, values = outputs(actors, x), outputs(critics, x)[..., 0]
-            if deviation is not None:
-                parameters = _with_deviation(parameters, deviation)
-            return torch.from_numpy(parameters), torch.from_numpy(values)
-
-        return policy
-
 
 def averaged(network: Callable[[Weights, Tensor], Outputs], players: Sequence[Weights]) -> Acting:
     """The average of a network's players, without gradients, as a function of observations."""
@@ -225,21 +167,6 @@ def averaged(network: Callable[[Weights, Tensor], Outputs], players: Sequence[We
         return average(torch.stack(parameters, 1)), average(torch.stack(values, 1))
 
     return policy
-
-
-def vjp(
-    network: Callable[[Weights, Tensor], Outputs], weights: Weights, observations: Tensor
-) -> tuple[Outputs, PullBack]:
-    """:meth:`Network.vjp` by torch's automatic differentiation."""
-    leaves = {name: w.detach().requires_grad_() for name, w in weights.items()}
-    with torch.enable_grad():
-        outputs = network(leaves, observations)
-
-    def pull_back(of_parameters: Tensor, of_values: Tensor) -> list[Tensor]:
-        slopes = (of_parameters, of_values)
-        return list(torch.autograd.grad(outputs, list(leaves.values()), slopes))
-
-    return (outputs[0].detach(), outputs[1].detach()), pull_back
 
 
 @checked
@@ -278,39 +205,6 @@ class Tanh(torch.autograd.Function):
     def backward(ctx: Any, gradient: Tensor) -> Tensor:
         (y,) = ctx.saved_tensors
         return torch.ops.aten.tanh_backward(gradient, y)  # gradient (1 - y^2), in one pass
-
-
-def inputs_and_output(layers: Layers, x: np.ndarray) -> list[np.ndarray]:
-    """What goes into each of the layers, with tanh between them, and what comes out at the end."""
-    values = [x]
-    for number, (matrix, bias) in enumerate(layers):
-        y = values[-1] @ matrix
-        y += bias
-        values.append(y if number == len(layers) - 1 else np.tanh(y, out=y))
-    return values
-
-
-def slopes_of_layers(layers: Layers, values: list[np.ndarray], slope: np.ndarray) -> Layers:
-    """From a loss's slope ``[R, B, units]`` in the output to those in matrices and biases.
-
-    ``values`` are those of :func:`inputs_and_output`. Back through a layer y = tanh(x) W + b::
-
-        dL/dW = tanh(x)' dL/dy,    dL/db = 1' dL/dy,    dL/dx = (dL/dy W') (1 - tanh(x)^2)
-    """
-    ones = np.ones((1, 1, slope.shape[1]), slope.dtype)
-    found: Layers = []
-    for number in reversed(range(len(layers))):
-        x = values[number]
-        found.append((x.swapaxes(1, 2) @ slope, (ones @ slope)[:, 0]))  # a product: a fast sum
-        if number > 0:
-            slope = slope @ layers[number][0].swapaxes(1, 2)
-            slope *= 1 - x * x
-    return found[::-1]
-
-
-def _with_deviation(means: np.ndarray, deviation: np.ndarray) -> np.ndarray:
-    """Parameters of a Gaussian from means ``[R, B, A]`` and deviations ``[R, A]``."""
-    return np.concatenate([means, np.broadcast_to(deviation[:, None], means.shape)], -1)
 
 
 def _orthogonal(shape: tuple[int, int], generator: np.random.Generator) -> np.ndarray:

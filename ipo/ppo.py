@@ -401,30 +401,6 @@ def minibatches(
         yield type(frames)(*batch[: len(frames)]), list(batch[len(frames) :])
 
 
-def clipped_loss(
-    distribution: type[Distribution],
-    parameters: Tensor,
-    values: Tensor,
-    batch: Rollout,
-    settings: PPOSettings,
-) -> Tensor:
-    """PPO's loss ``[R]``, to be minimised, on a minibatch ``[R, B]``::
-
-        - mean min(rho A, clip(rho, 1 - c, 1 + c) A) - w_e mean H(pi)
-        + w_v mean max((V - G)^2, (clip(V, V_old - c, V_old + c) - G)^2),
-        rho = pi(a | o) / pi_old(a | o)
-
-    G are the returns of the rollout.
-    """
-    gain, near_gain = gains(distribution, parameters, batch, settings)
-    error, near_error = _errors(values, batch, settings)
-    return (
-        -torch.minimum(gain, near_gain).mean(1)
-        - settings.entropy_weight * distribution.entropy(parameters).mean(1)
-        + settings.value_weight * torch.maximum(error**2, near_error**2).mean(1)
-    )
-
-
 def loss_gradient(
     distribution: type[Distribution],
     parameters: Tensor,
@@ -432,15 +408,24 @@ def loss_gradient(
     batch: Rollout,
     settings: PPOSettings,
 ) -> tuple[Tensor, Tensor]:
-    """Of :func:`clipped_loss` in each frame's parameters ``[R, B, P]`` and value ``[R, B]``::
+    """Of PPO's loss in each frame's parameters ``[R, B, P]`` and value ``[R, B]``.
+
+    The loss, to be minimised, on a minibatch ``[R, B]``; G are the returns of the rollout::
+
+        - mean min(rho A, clip(rho, 1 - c, 1 + c) A) - w_e mean H(pi)
+        + w_v mean max((V - G)^2, (clip(V, V_old - c, V_old + c) - G)^2),
+        rho = pi(a | o) / pi_old(a | o)
+
+    Its gradient, by hand, for torch would take four times as long::
 
         - (1/B) [rho A grad log pi(a | o) + w_e grad H(pi)],        (2 w_v / B) (V - G)
 
     without rho A and V - G where the minimum and the maximum are those of the clipped numbers,
-    which are constant. By hand, for torch would take four times as long.
+    which are constant.
     """
     gain, near_gain = gains(distribution, parameters, batch, settings)
-    error, near_error = _errors(values, batch, settings)
+    near = values.clamp(batch.values - settings.clip, batch.values + settings.clip)
+    error, near_error = values - batch.returns, near - batch.returns
     share = 1 / values.shape[1]
     weights = -share * gain.masked_fill(near_gain < gain, 0.0)
     of_parameters = distribution.gradient(
@@ -460,12 +445,6 @@ def gains(
     ratio = distribution.log_probability(parameters, batch.actions) - batch.log_probabilities
     ratio = ratio.exp()
     return ratio * advantages, ratio.clamp(1 - settings.clip, 1 + settings.clip) * advantages
-
-
-def _errors(values: Tensor, batch: Rollout, settings: PPOSettings) -> tuple[Tensor, Tensor]:
-    """``V - G`` and ``clip(V) - G``, ``[R, B]`` each."""
-    near = values.clamp(batch.values - settings.clip, batch.values + settings.clip)
-    return values - batch.returns, near - batch.returns
 
 
 def standardize(gains: Tensor) -> Tensor:

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import torch
+from threadpoolctl import threadpool_limits
 from torch import Tensor
 from tqdm.auto import tqdm
 
@@ -24,7 +25,6 @@ from ipo.distributions import Generators
 from ipo.networks import Network, copied
 from ipo.own_domains.copies import Copies, Domains, check_domains
 from ipo.own_domains.policy import Policy, check_network, network_for
-from ipo.own_domains.threads import one_thread
 from ipo.ppo import METHODS, PPOSettings, Training
 from ipo.rollouts import Device
 
@@ -42,6 +42,9 @@ __all__ = [
 ]
 
 PPO_RATE, IPO_RATE = 1e-3, 5e-4  # of the paper
+
+# On matrices as small as those of policies more threads wait for each other.
+one_thread = threadpool_limits.wrap(limits=1)
 
 
 def default_settings(method: str, num_domains: int, **changes: Any) -> PPOSettings:
@@ -62,7 +65,7 @@ def default_settings(method: str, num_domains: int, **changes: Any) -> PPOSettin
     return PPOSettings(method, **(sensible | changes))
 
 
-@one_thread()
+@one_thread
 @checked
 def train_policy(
     domains: Domains,
@@ -109,7 +112,7 @@ def train_policy(
     return Policy(label or method, tuple(seeds), observations, actions, network, players)
 
 
-@one_thread()
+@one_thread
 @checked
 def evaluate_policy(
     policy: Policy,

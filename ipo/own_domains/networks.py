@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import conv2d
 
+from ipo.dense_in_numpy import DenseInNumpy
 from ipo.distributions import Distribution, Gaussian
-from ipo.networks import DenseNetwork, Network, Outputs, Weights
+from ipo.networks import DenseNetwork, Outputs, Weights
 
 __all__ = ["ImageNetwork", "VectorNetwork"]
 
@@ -19,8 +20,8 @@ SMALL = 4  # pixels of the shorter side, at which convolutions stop
 CHANNELS = (32, 64)  # of the first convolution, and of all others
 
 
-class VectorNetwork(DenseNetwork):
-    """A :class:`ipo.networks.DenseNetwork` that starts without preferences among actions.
+class _Unbiased(DenseNetwork):
+    """It starts without preferences among actions.
 
     The actor's last layer starts at a hundredth of an orthogonal matrix, the critic's at one, as
     Andrychowicz et al. (2021) advise.
@@ -33,7 +34,11 @@ class VectorNetwork(DenseNetwork):
         return weights
 
 
-class ImageNetwork(VectorNetwork):
+class VectorNetwork(_Unbiased, DenseInNumpy):
+    """A :class:`ipo.networks.DenseNetwork` that starts without preferences among actions."""
+
+
+class ImageNetwork(_Unbiased):
     """Convolutions that actor and critic share, and a hidden layer of tanh units for each.
 
     A convolution is 3x3 with stride 2 and a ReLU; there are as many as it takes until the shorter
@@ -84,5 +89,3 @@ class ImageNetwork(VectorNetwork):
         runs = zip(x, matrices, biases, strict=True)
         kernels = ((own, w.T.unflatten(1, (-1, 3, 3)), b) for own, w, b in runs)
         return torch.stack([conv2d(own, k, b, stride=2, padding=1) for own, k, b in kernels]).relu()
-
-    frozen, vjp = Network.frozen, Network.vjp  # in torch: here convolutions take the time

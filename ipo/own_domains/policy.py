@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import io
 import os
-import zipfile
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -110,7 +108,7 @@ class Policy:
         return cls(str(arrays["label"]), tuple(arrays["seeds"].tolist()), *spaces, network, players)
 
 
-def network_for(observations: Space, actions: Space) -> VectorNetwork:
+def network_for(observations: Space, actions: Space) -> VectorNetwork | ImageNetwork:
     """An actor-critic whose kind and sizes fit the spaces."""
     distribution: type[Distribution] = Gaussian if isinstance(actions, Box) else Categorical
     num_actions = int(actions.n) if isinstance(actions, Discrete) else flatdim(actions)
@@ -146,23 +144,13 @@ def _read(file: BinaryIO) -> dict[str, np.ndarray]:
     size = os.fstat(file.fileno()).st_size
     if not size:  # or it is a device, which zipfile might read for ever
         raise ValueError("it is empty")
-    with zipfile.ZipFile(file) as archive:
-        parts = archive.infolist()
-        if sum(part.file_size for part in parts) > size:
+    with np.load(file, allow_pickle=False) as archive:
+        if sum(part.file_size for part in archive.zip.infolist()) > size:
             raise ValueError("it would unpack to more than it is")
-        arrays = {part.filename.removesuffix(".npy"): _array(archive.read(part)) for part in parts}
+        arrays = dict(archive)
     if arrays.get("format") != FORMAT:
         raise ValueError(f"its format is not {FORMAT!r}")
     return arrays
-
-
-def _array(content: bytes) -> np.ndarray:
-    """As ``np.savez`` writes one. NumPy's reader takes memory for what the header claims."""
-    file = io.BytesIO(content)
-    np.lib.format.read_magic(file)
-    shape, is_fortran, dtype = np.lib.format.read_array_header_1_0(file)
-    values = np.frombuffer(bytearray(file.read()), dtype)
-    return values.reshape(shape, order="F" if is_fortran else "C")
 
 
 def _weights(arrays: dict[str, np.ndarray]) -> Weights:

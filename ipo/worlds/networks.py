@@ -7,6 +7,7 @@ here are evaluated once for each of them, not once for each frame.
 from __future__ import annotations
 
 import math
+from abc import abstractmethod
 from collections.abc import Sequence
 from typing import Annotated
 
@@ -15,10 +16,10 @@ import torch
 from torch import Tensor
 
 from ipo.checks import Count, Positive, checked
+from ipo.dense_in_numpy import DenseInNumpy
 from ipo.distributions import Categorical, Generators
 from ipo.networks import (
     Acting,
-    DenseNetwork,
     Network,
     Outputs,
     PullBack,
@@ -96,8 +97,21 @@ class GridNetwork(Network):
         return logits, values.squeeze(-1)
 
 
-class OnTable(Network):
-    """A network whose observations are indices of rows in a table of K distinct ones.
+class TableNetwork(Network):
+    """A network whose observations are indices of rows in a table of K distinct ones."""
+
+    @abstractmethod
+    def average(self, players: Sequence[Weights]) -> Outputs:
+        """What the players' average makes of the whole table: ``[R, K, A]`` and ``[R, K]``."""
+
+    def frozen(self, players: Sequence[Weights]) -> Acting:
+        """The average of ``players`` as they are now, as a function of ``indices [R, B]``."""
+        logits, values = self.average(players)
+        return lambda indices: (chosen_rows(logits, indices), chosen_rows(values, indices))
+
+
+class OnTable(TableNetwork):
+    """A grid network on a table.
 
     The network is evaluated once for each row that occurs, not once for each occurrence; what comes
     before the second convolution once for each distinct part of the table's images. There are few,
@@ -154,7 +168,6 @@ class OnTable(Network):
         return x.reshape(-1, num_runs, num_units).transpose(0, 1)
 
     def average(self, players: Sequence[Weights]) -> Outputs:
-        """What the players' average makes of the whole table: ``[R, K, A]`` and ``[R, K]``."""
         self._check(players)
         weight = next(iter(players[0].values()))
         policy = averaged(self, players)
@@ -163,14 +176,9 @@ class OnTable(Network):
         logits, values = zip(*map(policy, rows.split(PIECE, 1)), strict=True)
         return torch.cat(logits, 1), torch.cat(values, 1)
 
-    def frozen(self, players: Sequence[Weights]) -> Acting:
-        """The average of ``players`` as they are now, as a function of ``indices [R, B]``."""
-        logits, values = self.average(players)
-        return lambda indices: (chosen_rows(logits, indices), chosen_rows(values, indices))
 
-
-class DenseOnTable(DenseNetwork):
-    """A dense actor-critic whose observations are indices of rows in a table of K distinct ones.
+class DenseOnTable(TableNetwork, DenseInNumpy):
+    """A dense actor-critic on a table.
 
     Args:
         table: the observations.
@@ -194,15 +202,9 @@ class DenseOnTable(DenseNetwork):
         return super().vjp(weights, self.table[indices])
 
     def average(self, players: Sequence[Weights]) -> Outputs:
-        """What the players' average makes of the whole table: ``[R, K, A]`` and ``[R, K]``."""
         self._check(players)
         num_runs = len(next(iter(players[0].values())))
-        return super().frozen(players)(self.table.expand(num_runs, -1, -1))
-
-    def frozen(self, players: Sequence[Weights]) -> Acting:
-        """The average of ``players`` as they are now, as a function of ``indices [R, B]``."""
-        logits, values = self.average(players)
-        return lambda indices: (chosen_rows(logits, indices), chosen_rows(values, indices))
+        return DenseInNumpy.frozen(self, players)(self.table.expand(num_runs, -1, -1))
 
 
 def _patches(x: Tensor) -> Tensor:

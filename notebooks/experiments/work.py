@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import joblib
+from threadpoolctl import threadpool_limits
 
 from experiments import origin
 from experiments.orphans import end_with
@@ -50,9 +51,9 @@ def finished(
 
 def _in_one_thread(job: Job) -> Any:
     """As on any worker, so that rows do not depend on who computes them, and threads not wait."""
-    from ipo.own_domains.threads import one_thread  # torch, which those who only read do not need
+    import torch  # noqa: F401  (threads are limited of what is loaded; who only reads needs it not)
 
-    with one_thread():
+    with threadpool_limits(1):
         return job()
 
 

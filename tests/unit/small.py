@@ -7,9 +7,12 @@ import torch
 from plain_ppo import ActorCritic
 from torch import Tensor
 
+from ipo.distributions import Distribution
 from ipo.lqr import LQR, sample_problem
 from ipo.lqr_learners import LQRSettings, train
 from ipo.networks import Outputs, Weights
+from ipo.ppo import PPOSettings, gains
+from ipo.rollouts import Rollout
 from ipo.worlds.networks import GridNetwork
 
 
@@ -116,3 +119,28 @@ def assert_near(actual: Tensor, expected: object, atol: float) -> None:
     """Equal up to an absolute difference: for what a game has come close to."""
     expected = torch.as_tensor(expected, dtype=actual.dtype).broadcast_to(actual.shape)
     torch.testing.assert_close(actual, expected, rtol=0, atol=atol)
+
+
+def clipped_loss(
+    distribution: type[Distribution],
+    parameters: Tensor,
+    values: Tensor,
+    batch: Rollout,
+    settings: PPOSettings,
+) -> Tensor:
+    """PPO's loss ``[R]``, to be minimised, on a minibatch ``[R, B]``::
+
+        - mean min(rho A, clip(rho, 1 - c, 1 + c) A) - w_e mean H(pi)
+        + w_v mean max((V - G)^2, (clip(V, V_old - c, V_old + c) - G)^2),
+        rho = pi(a | o) / pi_old(a | o)
+
+    G are the returns of the rollout.
+    """
+    gain, near_gain = gains(distribution, parameters, batch, settings)
+    near = values.clamp(batch.values - settings.clip, batch.values + settings.clip)
+    error, near_error = values - batch.returns, near - batch.returns
+    return (
+        -torch.minimum(gain, near_gain).mean(1)
+        - settings.entropy_weight * distribution.entropy(parameters).mean(1)
+        + settings.value_weight * torch.maximum(error**2, near_error**2).mean(1)
+    )

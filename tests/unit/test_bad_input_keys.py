@@ -22,10 +22,10 @@ from experiments.sealed import DamagedError, write_sealed
 from experiments.tabulated import load_or_tabulate
 from ipo.networks import Weights
 from ipo.ppo import PPOSettings, Training
-from ipo.rollouts import FromGymnasium
 from ipo.worlds.colored_keys import ColoredKeysEnv
 from ipo.worlds.networks import GridNetwork
 from ipo.worlds.tabular import NotTabularError
+from ipo.worlds.vector_environments import FromGymnasium
 
 # -------------------------------------------------------------------------- environment
 

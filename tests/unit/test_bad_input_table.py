@@ -39,11 +39,20 @@ from experiments.store import Store
 from experiments.witness import side_by_side
 from ipo import game, lqr, lqr_learners, optimizers, own_domains, ppo, rollouts, stats
 from ipo.causality import icp, predictors, regressions, scm, small_games
+from ipo.dense_in_numpy import DenseInNumpy
 from ipo.distributions import Categorical
 from ipo.networks import DenseNetwork, copied
 from ipo.own_domains import copies, networks
 from ipo.own_domains import policy as policies
-from ipo.worlds import colored_keys, cued_maze, door, many_doors, one_door, tabular
+from ipo.worlds import (
+    colored_keys,
+    cued_maze,
+    door,
+    many_doors,
+    one_door,
+    tabular,
+    vector_environments,
+)
 from ipo.worlds.networks import DenseOnTable, GridNetwork, OnTable
 
 NAN, INF = math.nan, math.inf
@@ -251,6 +260,7 @@ def rows_of_learning() -> Iterator[Row]:
     yield row(game.nash_gap, both, costs=fits, best_costs=fits)
 
     grid, dense = GridNetwork(), DenseNetwork(3, 2, hidden=(4,))
+    in_numpy = DenseInNumpy(3, 2, hidden=(4,))
     yield row(
         DenseNetwork,
         {"num_observations": 3, "num_actions": 2},
@@ -268,7 +278,8 @@ def rows_of_learning() -> Iterator[Row]:
     good = {"table": few, "num_actions": 2, "hidden": (4,)}
     yield row(DenseOnTable, good, table=fits, hidden=sizes)
     yield row(grid.start, {"generators": generators}, generators=LIST + bad("shape", [0]))
-    for network, good in ((grid, grid), (dense, dense), (on_table, grid), (of_table, dense)):
+    of_dense = [(network, dense) for network in (dense, in_numpy, of_table)]
+    for network, good in ((grid, grid), (on_table, grid), *of_dense):
         of_others = [DenseNetwork(2, 2).start(generators)]
         refused = LIST + bad("shape", of_others, [{}]) + bad("kind of object", [3], [{"a": 3}])
         yield row(network.frozen, {"players": [good.start(generators)]}, players=refused)
@@ -282,9 +293,9 @@ def rows_of_learning() -> Iterator[Row]:
     make = functools.partial(gymnasium.make, "CartPole-v1")
     envs = SyncVectorEnv([make] * 4, autoreset_mode=AutoresetMode.SAME_STEP)
     others = SyncVectorEnv([make] * 4)
-    environments = rollouts.FromGymnasium(envs, 2, seed=0)
+    environments = vector_environments.FromGymnasium(envs, 2, seed=0)
     yield row(
-        rollouts.FromGymnasium,
+        vector_environments.FromGymnasium,
         {"envs": envs, "num_runs": 2, "seed": 0},
         envs=bad("kind of object", others),
         num_runs="checked by who makes them",
@@ -735,9 +746,10 @@ TRUSTING = {
     r"ipo\.lqr\.(LQR\.to|split_domains)": "torch's own conversion and view, by a new name",
     r"ipo\.lqr_learners\.Learner": RECORD,
     r"ipo\.(worlds\.)?networks\.\w+\.(__call__|after_pooling|vjp)": LOOP,
-    r"ipo\.networks\.(averaged|chosen_rows|dense|in_one_row|vjp|Tanh.*)": LOOP,
+    r"ipo\.networks\.(averaged|chosen_rows|dense|in_one_row|Tanh.*)": LOOP,
+    r"ipo\.dense_in_numpy\.(DenseInNumpy|DenseInNumpy\.vjp)": "as in ipo.networks",
+    r"ipo\.worlds\.networks\.TableNetwork\.average": "that of OnTable and DenseOnTable",
     r"ipo\.worlds\.networks\.OnTable\.start": "hands on what it is given",
-    r"ipo\.networks\.(inputs_and_output|slopes_of_layers)": LOOP,
     r"ipo\.own_domains\.copies\.check_domains": "is a check itself; train_policy shows it",
     r"ipo\.own_domains\.copies\.(Copies.*|is_\w+|dtype_of|clipped)": "of checked domains",
     r"ipo\.own_domains\.policy\.(Policy|Policy\.save|network_for)": "of checked spaces",
@@ -747,10 +759,11 @@ TRUSTING = {
     r"ipo\.rollouts\.check_device": "is a check itself; Training shows it",
     r"ipo\.own_domains\.default_settings": "PPOSettings checks",
     r"ipo\.ppo\.Training\.(respond|improve)": LOOP,
-    r"ipo\.ppo\.(minibatches|clipped_loss|loss_gradient|gains|standardize)": LOOP,
-    r"ipo\.(ppo|rollouts)\.\w+\.restore": STATE,
+    r"ipo\.ppo\.(minibatches|loss_gradient|gains|standardize)": LOOP,
+    r"ipo\.(ppo|rollouts|worlds\.vector_environments)\.\w+\.restore": STATE,
     r"ipo\.rollouts\.(Step|Rollout)": RECORD,
     r"ipo\.(stats\.Difference|game\.Move)": RECORD,
+    r"ipo\.worlds\.vector_environments\.FromGymnasium\.step": LOOP,
     r"ipo\.rollouts\.(\w+\.step|\w+\.__call__|Collector\.collect)": LOOP,
     r"ipo\.rollouts\.(value_errors|advantages)": LOOP,
     r"ipo\.causality\.icp\.ICPResult": RECORD,

@@ -12,8 +12,9 @@ from small import assert_close
 from torch import Tensor
 
 from experiments.policies import load_policy, save_policy
+from ipo.dense_in_numpy import DenseInNumpy
 from ipo.distributions import Categorical, Gaussian
-from ipo.networks import DenseNetwork, vjp
+from ipo.networks import DenseNetwork
 
 
 def generators(*seeds: int) -> list[np.random.Generator]:
@@ -73,8 +74,9 @@ def test_categorical_samples_are_as_frequent_as_they_should_be():
 # ------------------------------------------------------------------ the network for vectors
 
 
-def test_players_are_averaged_in_means_and_deviations_not_in_their_logarithms():
-    network = DenseNetwork(4, 2)
+@pytest.mark.parametrize("kind", [DenseNetwork, DenseInNumpy])
+def test_players_are_averaged_in_means_and_deviations_not_in_their_logarithms(kind):
+    network = kind(4, 2)
     players = [network.start(generators(d)) for d in range(2)]
     players[0]["log_std"][:] = 0.0
     players[1]["log_std"][:] = math.log(3.0)
@@ -121,14 +123,14 @@ def test_the_networks_gradient_is_right(distribution):
 @pytest.mark.parametrize("hidden", [(), (4,), (4, 3)])
 @pytest.mark.parametrize("dtype, rtol", [(torch.float64, 1e-12), (torch.float32, 1e-5)])
 def test_the_gradient_by_hand_is_that_of_torch(distribution, hidden, dtype, rtol):
-    network = DenseNetwork(3, 2, distribution, hidden)
+    network, of_torch = (kind(3, 2, distribution, hidden) for kind in (DenseInNumpy, DenseNetwork))
     weights = {name: w.to(dtype) for name, w in network.start(generators(0, 1)).items()}
     generator = torch.Generator().manual_seed(0)
     for weight in weights.values():  # no number is 0 by chance
         weight += 0.5 * torch.randn(weight.shape, generator=generator)
     observations = torch.randn(2, 7, 3, generator=generator, dtype=dtype)
     outputs, pull_back = network.vjp(weights, observations)
-    expected, torchs_pull_back = vjp(network, weights, observations)
+    expected, torchs_pull_back = of_torch.vjp(weights, observations)
     slopes = [torch.randn(x.shape, generator=generator, dtype=dtype) for x in outputs]
     found = [*outputs, *pull_back(*slopes)]
     for ours, theirs in zip(found, [*expected, *torchs_pull_back(*slopes)], strict=True):

@@ -22,7 +22,6 @@ from ipo.own_domains import (
 )
 from ipo.own_domains.copies import Copies
 from ipo.own_domains.networks import ImageNetwork, VectorNetwork
-from ipo.own_domains.threads import one_thread
 from ipo.ppo import METHODS
 
 TINY = {"num_updates": 1, "num_steps": 16, "num_epochs": 1, "minibatch_size": 16}
@@ -167,7 +166,10 @@ def test_no_flipped_bit_changes_a_policy_in_silence(tmp_path):
     [
         (None, "path = .*: is no file that Policy.save wrote"),
         ({"a": 1}, "path = .*: is no file that Policy.save wrote"),
-        ({"format": np.array([print], dtype=object)}, "path = .*: is no file that .* OBJECT array"),
+        (
+            {"format": np.array([print], dtype=object)},
+            "path = .*: is no file that .* Object arrays",
+        ),
     ],
 )
 def test_a_foreign_file_is_refused_and_not_executed(tmp_path, arrays, message):
@@ -264,18 +266,23 @@ def test_a_parameter_that_was_set_on_a_wrapper_is_a_warning():
         check_domains("domains", {"short": pole("length", 0.4), "long": pole("length", 0.6)})
 
 
-def test_one_thread_is_a_setting_of_the_block_alone():
+def test_one_thread_is_a_setting_of_the_training_alone():
     def threads():
         blas = [pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"]
         return torch.get_num_threads(), blas
 
-    own = torch.get_num_threads()
+    class Watching(Counting):
+        def step(self, action):
+            seen.append(threads())
+            raise KeyError
+
+    own, seen = torch.get_num_threads(), []
     torch.set_num_threads(2)
     before = threads()
-    with pytest.raises(KeyError), one_thread():
-        assert threads() == (1, [1] * len(before[1]))
-        raise KeyError
+    with pytest.raises(KeyError):
+        train_policy({"a": Watching}, "ppo", **TINY)
     assert threads() == before
+    assert seen == [(1, [1] * len(before[1]))]
     torch.set_num_threads(own)
 
 

@@ -16,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from minigrid.envs import EmptyEnv
 from minigrid.wrappers import ImgObsWrapper
-from small import DoubleNetwork, assert_close, plain_network
+from small import DoubleNetwork, assert_close, clipped_loss, plain_network
 from torch import Tensor
 
 from experiments.keys import published
@@ -29,21 +29,14 @@ from ipo.ppo import (
     METHODS,
     PPOSettings,
     Training,
-    clipped_loss,
     loss_gradient,
     minibatches,
 )
-from ipo.rollouts import (
-    Collector,
-    FromGymnasium,
-    Rollout,
-    Step,
-    advantages,
-    value_errors,
-)
+from ipo.rollouts import Collector, Rollout, Step, advantages, value_errors
 from ipo.worlds.colored_keys import ColoredKeysEnv
 from ipo.worlds.networks import GridNetwork, OnTable
 from ipo.worlds.tabular import TabularDomains, expected_return, optimal_policy, tabulate
+from ipo.worlds.vector_environments import FromGymnasium
 
 SMALL = {
     "num_updates": 3,

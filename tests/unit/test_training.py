@@ -12,7 +12,8 @@ from torch import Tensor
 from ipo.distributions import Gaussian
 from ipo.networks import DenseNetwork, copied
 from ipo.ppo import METHODS, PPOSettings, Training
-from ipo.rollouts import Collector, FromGymnasium, RewardNormalizer, Step
+from ipo.rollouts import Collector, RewardNormalizer, Step
+from ipo.worlds.vector_environments import FromGymnasium
 
 SMALL = {"num_envs": 4, "num_steps": 16, "minibatch_size": 16, "num_updates": 4, "num_epochs": 2}
 

@@ -22,14 +22,15 @@ from experiments.experiment import Experiment, plain
 from experiments.files import check_file_name
 from experiments.policies import check_place, load_policy, save_policy
 from ipo.checks import Count, checked
+from ipo.dense_in_numpy import DenseInNumpy
 from ipo.distributions import Gaussian
-from ipo.networks import DenseNetwork, Weights, copied
+from ipo.networks import Weights, copied
 from ipo.ppo import PPOSettings, Training
-from ipo.rollouts import FromGymnasium
 from ipo.worlds.many_doors import VectorDoor
+from ipo.worlds.vector_environments import FromGymnasium
 
 TRAIN_FRICTIONS = (0.0, 0.1)
-NETWORK = DenseNetwork(15, 6, Gaussian)
+NETWORK = DenseInNumpy(15, 6, Gaussian)
 NUM_LAST = 10  # training episodes whose mean return decides which policy is the best
 CURVE_FRICTION, NUM_CURVE_DOORS, CURVE_SEED = 1.3, 50, 20201106
 CHOICES = ("best", "last")
