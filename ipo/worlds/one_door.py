@@ -42,7 +42,8 @@ class DoorEnv(gym.Env):
 
     Attributes:
         params: the door, once ``reset`` has drawn it.
-        model, data: of MuJoCo.
+        model: of MuJoCo.
+        data: of MuJoCo, the state.
         handle_shift: of the handle along y and z in this episode, in m.
 
     Raises:
