@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
-from functools import partial
 
 import pandas as pd
 
@@ -33,18 +32,9 @@ ARMS = {
 }
 
 
-def turn_cells(
-    sizes: Iterable[tuple[int, int]], apart: Iterable[tuple[int, int]], num_iterations: int
-) -> list[Cell]:
-    """The arms that are not in the paper's tables, for pairs of n_d and n_y.
-
-    One controller that visits the domains in turn at all ``sizes``; arms that cost n_d times as
-    much, and players that move together, at those of ``apart``.
-    """
-    of = partial(arms, num_iterations=num_iterations)
-    single = [arm for size in sizes for arm in of(*size) if arm.label.startswith("in_turn")]
-    others = [arm for size in apart for arm in of(*size) if not arm.label.startswith("in_turn")]
-    return single + others
+def turn_cells(sizes: Iterable[tuple[int, int]], num_iterations: int) -> list[Cell]:
+    """The arms that are not in the paper's tables, for pairs of n_d and n_y."""
+    return [arm for size in sizes for arm in arms(*size, num_iterations)]
 
 
 def arms(num_domains: int, dim_distractor: int, num_iterations: int) -> list[Cell]:
@@ -69,7 +59,7 @@ def costs(rows: pd.DataFrame, **fixed: int) -> pd.DataFrame:
     """Cost in a new domain, mean ± standard deviation over runs, by arm and number of domains."""
     chosen = select(rows, {"metric": "test_cost", "optimizer": "adam", **fixed})
     groups = chosen.groupby(["method", "num_domains"])["value"]
-    table = groups.agg(mean_and_std).unstack().reindex(list(ARMS)).fillna("")
+    table = groups.agg(mean_and_std).unstack().reindex(list(ARMS))
     table = table.rename(index=ARMS, columns="{} domains".format)
     return table.rename_axis(index="arm", columns=None).reset_index()
 
@@ -89,7 +79,7 @@ def recovered(rows: pd.DataFrame) -> pd.DataFrame:
 def shares_table(rows: pd.DataFrame) -> pd.DataFrame:
     """:func:`recovered`, and how much more one domain at a time costs than IPO, paired by run."""
     shares = recovered(rows).drop(columns=["gradient_descent", "ipo_fixed_phi"])
-    table = shares.map("{:.2f}".format, na_action="ignore").fillna("").rename(columns=ARMS)
+    table = shares.map("{:.2f}".format).rename(columns=ARMS)
     table["one domain at a time − IPO, cost"] = [
         f"{found.mean:+.1f} [{found.low:+.1f}, {found.high:+.1f}]"
         for _, own in _by_arm(rows).groupby(level=["num_domains", "dim_distractor"])

@@ -36,8 +36,8 @@ ASKED = {  # cells and number of runs
     "optimizers": (lqr.optimizer_cells([2, 5, 10], 1000, 5000), 10),
     "outside": (lqr.published_cells(2, 1000, 5000), 2),
     "controls": (lqr.control_cells([2, 5, 10], 1000, 5000), 10),
-    "regularized": (trials.lqr_cells(5, 1000, 5000), 10),
-    "turns": (lqr_turns.turn_cells(SIZES, [(2, 1000), (5, 1000), (10, 1000)], 5000), 10),
+    "regularized": ([c for n in (2, 5, 10) for c in trials.lqr_cells(n, 1000, 5000)], 10),
+    "turns": (lqr_turns.turn_cells(SIZES, 5000), 10),
 }
 UNREACHED = pytest.mark.xfail(strict=True, reason="no reading of the unpublished start reaches it")
 

@@ -97,6 +97,24 @@ class Trial:
         grid = self.grid.items()
         return pd.DataFrame([row(name, weight) for name, own in grid for weight in own])
 
+    def chosen_table(self, by_place: Mapping[Any, pd.DataFrame], place: str) -> pd.DataFrame:
+        """What the rule chooses in each place; values by place, whose column is named."""
+
+        def row(here: Any, name: str, weight: float) -> dict[str, Any]:
+            gaps = [self.gap(by_place[here], name, weight, o) for o in (self.baseline, self.ipo)]
+            none, ipo = gaps if weight else ("–", "–")
+            return {
+                place: here,
+                "regulariser": NAMES[name],
+                "weight": f"{weight:g}" if weight else "none",
+                "difference to none": none,
+                "difference to IPO": ipo,
+            }
+
+        found = {here: self.chosen(values) for here, values in by_place.items()}
+        rows = [(here, *one) for here, chosen in found.items() for one in chosen.items()]
+        return pd.DataFrame([row(*one) for one in rows])
+
     def spread(self, runs: pd.Series) -> str:
         """Mean ± standard deviation, or in how many runs a cost is infinite."""
         lost = np.isinf(runs)
