@@ -55,6 +55,15 @@ def test_the_table_says_what_is_chosen_and_how_far_it_is_from_others():
     assert table.index[table["chosen"] == "✓"].tolist() == [("IRMv1", "10")]
 
 
+def test_the_rule_chooses_in_each_place_for_itself():
+    places = {2: made_up(0.9, 0.89), 5: made_up(0.9, 0.87)}
+    table = KEYS.chosen_table(places, "domains").set_index(["domains", "regulariser"])
+    assert len(table) == 2 * len(KEYS.grid)
+    chosen, none = table.loc[(2, "IRMv1")], table.loc[(5, "IRMv1")]
+    assert chosen["weight"] == "10" and chosen["difference to IPO"] == "+0.400 [+0.400, +0.400]"
+    assert none["weight"] == "none" and none["difference to IPO"] == "–"
+
+
 def test_arms_differ_from_the_published_baseline_in_one_setting_alone():
     for cells, plain in (
         (trials.keys_arms(20), keys.published("ppo")),
