@@ -94,7 +94,7 @@ def test_arms_are_two_trainings_at_two_times():
 
 def test_controls_are_trained_as_long_as_ipo_as_published():
     declared = door_training.controls()
-    assert controls(190, 4096) == {"in_turn": declared["in_turn"]}
+    assert controls(190, 4096) == {arm: declared[arm] for arm in ("ensemble", "in_turn")}
     assert {*controls(4, 512)} == {*CONTROLS} - {"ppo_half"}
     for cell in controls(4, 512).values():
         assert (cell.settings.num_updates, cell.saved_after) == (2, (2,))
@@ -137,14 +137,16 @@ def test_comparisons_of_two_arms(success):
 
 
 def test_controls_are_paired_with_the_runs_of_ipo_that_they_have(success):
-    """Runs 0 and 1 of the control, of IPO's three."""
+    """Runs 0 and 1 of the controls, of IPO's three."""
     arms = ARMS | controls_of(controls(4, 512), frictions=FRICTIONS, num_doors=NUM_DOORS)
     of_ppo = success.query("method == 'ppo' and steps == 32768 and run < 2")
     opened = {0: 0.25, 1: 0.5}
     rows = of_ppo.assign(method="in_turn", value=of_ppo["run"].map(opened))
-    table = door_tables.controlled(pd.concat([success, rows]), arms, FRICTIONS, effect=10.0)
-    assert list(table["pairs"]) == [3, 2]
-    assert list(table["difference"]) == pytest.approx([100 / 3, 12.5])
+    of_ensemble = rows.assign(method="ensemble", value=rows["value"] + 0.25)
+    every = pd.concat([success, rows, of_ensemble])
+    table = door_tables.controlled(every, arms, FRICTIONS, effect=10.0)
+    assert list(table["pairs"]) == [3, 2, 2]
+    assert list(table["difference"]) == pytest.approx([100 / 3, 12.5, -12.5])
     assert list(table["it opens"])[1] == "37.5 ± 12.5"
     assert table["power"].between(0.05, 1).all()
 

@@ -25,6 +25,7 @@ NAMES = {
 CONTROLS = {
     "ppo_half": "PPO",
     "in_turn": "one network, one domain at a time",
+    "ensemble": "ensemble, all doors for both networks",
 }  # as long as IPO as published was trained
 PUBLISHED = ("ppo", "ipo_half")  # with the steps of the published runs
 
