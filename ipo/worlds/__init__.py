@@ -1,8 +1,8 @@
 """The worlds that policies act in.
 
-``colored_keys`` (MiniGrid), and ``tabular``, which turns them into tables; ``cued_maze``, which is
-one, and ``networks`` for tables; ``door`` (MuJoCo), ``many_doors`` side by side, and ``one_door``.
-Each brings its packages as an extra: ``ipo[keys,door]``.
+``colored_keys`` (MiniGrid), and ``minigrid_tables``, which makes tables of them; ``tabular``: what
+tables can do; ``cued_maze``, which is one; ``networks`` for tables; ``door`` (MuJoCo),
+``many_doors`` side by side, and ``one_door``. MiniGrid and MuJoCo are extras: ``ipo[keys,door]``.
 """
 
 from __future__ import annotations

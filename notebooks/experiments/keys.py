@@ -27,6 +27,7 @@ from ipo.distributions import Categorical
 from ipo.networks import Weights
 from ipo.ppo import MakeEnvironments, PPOSettings
 from ipo.worlds.colored_keys import COLORS, ColoredKeysEnv
+from ipo.worlds.minigrid_tables import tabulate
 from ipo.worlds.networks import GridNetwork, OnTable
 from ipo.worlds.tabular import (
     TabularDomains,
@@ -34,7 +35,6 @@ from ipo.worlds.tabular import (
     TabularTask,
     expected_return,
     optimal_policy,
-    tabulate,
 )
 
 TRAINED, TESTED = ("red", "green"), "grey"

@@ -22,7 +22,8 @@ from matplotlib.figure import Figure
 
 from ipo.checks import Count, check_choice, checked
 from ipo.worlds.door import DoorParams, build_door, shift_handle
-from ipo.worlds.tabular import TabularTask, state_of
+from ipo.worlds.minigrid_tables import state_of
+from ipo.worlds.tabular import TabularTask
 
 
 def record(

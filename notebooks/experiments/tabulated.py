@@ -17,7 +17,8 @@ from gymnasium import Env
 
 from experiments.sealed import DamagedError
 from experiments.tensors import read_tensors, write_tensors
-from ipo.worlds.tabular import TabularTask, goal_reward, state_of, tabulate
+from ipo.worlds.minigrid_tables import goal_reward, state_of, tabulate
+from ipo.worlds.tabular import TabularTask
 
 FORM = "tensors"  # of the files; those of another one are not looked at
 NUM_STEPS = 200  # of random episodes in which a table and its environment are compared
@@ -28,7 +29,7 @@ class TableWarning(UserWarning):
 
 
 def load_or_tabulate(make_env: Callable[..., Env], folder: str | Path, **options) -> TabularTask:
-    """:func:`ipo.worlds.tabular.tabulate` ``make_env(**options)``, or the same from a file.
+    """:func:`ipo.worlds.minigrid_tables.tabulate` ``make_env(**options)``, or the same from a file.
 
     Where the folder cannot be written, the table is made each time, with a warning.
     """

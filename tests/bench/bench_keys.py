@@ -28,7 +28,8 @@ from tqdm import tqdm
 from experiments.keys import Cell, Keys, published
 from experiments.sealed import write_record
 from ipo.worlds.colored_keys import ColoredKeysEnv
-from ipo.worlds.tabular import expected_return, tabulate
+from ipo.worlds.minigrid_tables import tabulate
+from ipo.worlds.tabular import expected_return
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import plain_ppo

@@ -23,8 +23,8 @@ from experiments.tabulated import load_or_tabulate
 from ipo.networks import Weights
 from ipo.ppo import PPOSettings, Training
 from ipo.worlds.colored_keys import ColoredKeysEnv
+from ipo.worlds.minigrid_tables import NotTabularError
 from ipo.worlds.networks import GridNetwork
-from ipo.worlds.tabular import NotTabularError
 from ipo.worlds.vector_environments import FromGymnasium
 
 # -------------------------------------------------------------------------- environment

@@ -49,6 +49,7 @@ from ipo.worlds import (
     cued_maze,
     door,
     many_doors,
+    minigrid_tables,
     one_door,
     tabular,
     vector_environments,
@@ -581,9 +582,9 @@ def rows_of_worlds() -> Iterator[Row]:
     small = colored_keys.ColoredKeysEnv(max_steps=3)
     task = line_of_states()
     no_grid = OBJECT + bad("kind of object", gymnasium.make("CartPole-v1"))
-    yield row(tabular.tabulate, {"env": small}, env=no_grid)
-    yield row(tabular.goal_reward, {"env": small}, env=no_grid)
-    yield row(tabular.state_of, {"task": task, "env": small}, env=no_grid)
+    yield row(minigrid_tables.tabulate, {"env": small}, env=no_grid)
+    yield row(minigrid_tables.goal_reward, {"env": small}, env=no_grid)
+    yield row(minigrid_tables.state_of, {"task": task, "env": small}, env=no_grid)
     parts = {field.name: getattr(task, field.name) for field in fields(task)}
     loose = dict.fromkeys(("goal_reward", "images"), array("axes longer runs"))
     loose |= {"start": array("axes"), "next_state": array("longer runs")}
@@ -772,7 +773,8 @@ TRUSTING = {
     r"ipo\.causality\.scm\.(Linear|Mechanism)\.__call__": "called by SCM.sample with what it drew",
     r"ipo\.worlds\.door\.(hook_rotation|fingertip_position|target_position|reward|observe)": LOOP,
     r"ipo\.worlds\.door\.(lever|draw_start|shift_handle)": LOOP,
-    r"ipo\.worlds\.tabular\.(NotTabularError|TabularEnvironments)": "made by TabularDomains",
+    r"ipo\.worlds\.tabular\.TabularEnvironments": "made by TabularDomains",
+    r"ipo\.worlds\.minigrid_tables\.NotTabularError": "an error",
     r"ipo\.worlds\.tabular\.TabularEnvironments\.step": LOOP,
     r"experiments\.games\.scalar_control\.training_cost": LOOP,
     r"experiments\.doors\.hooking\.Hooking\.__call__": LOOP,

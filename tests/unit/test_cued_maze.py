@@ -1,5 +1,8 @@
 """The cued maze: its returns by hand, and what can be seen in it."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -111,3 +114,11 @@ def test_walls():
     assert (task.next_state[in_corridor][:, [LEFT, RIGHT]] == states[in_corridor, None]).all()
     assert (task.next_state[~in_corridor, FORWARD] == states[~in_corridor]).all()
     assert not task.done[in_corridor].any() and not task.done[:, FORWARD].any()
+
+
+def test_the_maze_needs_no_minigrid():
+    script = (
+        "import sys; sys.modules['minigrid'] = None\n"
+        "from ipo.worlds.cued_maze import cued_maze; cued_maze(0.5)"
+    )
+    subprocess.run([sys.executable, "-c", script], check=True)

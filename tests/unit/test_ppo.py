@@ -34,8 +34,9 @@ from ipo.ppo import (
 )
 from ipo.rollouts import Collector, Rollout, Step, advantages, value_errors
 from ipo.worlds.colored_keys import ColoredKeysEnv
+from ipo.worlds.minigrid_tables import tabulate
 from ipo.worlds.networks import GridNetwork, OnTable
-from ipo.worlds.tabular import TabularDomains, expected_return, optimal_policy, tabulate
+from ipo.worlds.tabular import TabularDomains, expected_return, optimal_policy
 from ipo.worlds.vector_environments import FromGymnasium
 
 SMALL = {

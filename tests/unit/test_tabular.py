@@ -23,15 +23,13 @@ from experiments.tabulated import TableWarning, load_or_tabulate
 from experiments.tensors import write_tensors
 from experiments.visits import occupancy, reach
 from ipo.worlds.colored_keys import COLORS, ColoredKeysEnv
+from ipo.worlds.minigrid_tables import NotTabularError, state_of, tabulate
 from ipo.worlds.tabular import (
-    NotTabularError,
     TabularDomains,
     TabularEnvironments,
     TabularTask,
     expected_return,
     optimal_policy,
-    state_of,
-    tabulate,
 )
 
 ARRAYS = [field.name for field in fields(TabularTask)]

@@ -16,7 +16,8 @@ from experiments.figures import label
 from experiments.keys import Keys
 from ipo.networks import Weights
 from ipo.worlds.colored_keys import ColoredKeysEnv
-from ipo.worlds.tabular import TabularTask, state_of
+from ipo.worlds.minigrid_tables import state_of
+from ipo.worlds.tabular import TabularTask
 
 NUM_RUNS = 3  # the first ones of every arm, whatever came out
 LAYOUTS = (0, 1, 2)  # seeds of MiniGrid's reset, likewise
