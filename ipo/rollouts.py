@@ -56,7 +56,7 @@ class RewardNormalizer:
     Args:
         num_runs, num_copies: R and N.
         discount: gamma.
-        clip: c.
+        clip: the bound c.
     """
 
     @checked

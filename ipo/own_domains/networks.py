@@ -49,7 +49,7 @@ class ImageNetwork(_Unbiased):
 
     Args:
         shape: of an image.
-        num_actions: A.
+        num_actions: A, of how many to choose or of how many numbers an action consists.
         distribution: of the actions.
         hidden: units of each hidden layer of actor and critic.
     """

@@ -44,7 +44,7 @@ class GridNetwork(Network):
 
     Args:
         num_channels: of the image; 3 for MiniGrid's codes of object, colour and state.
-        num_actions: A.
+        num_actions: A, of how many to choose.
         width: of all layers, relative to the published ones; sqrt(2) has twice as many weights.
     """
 
@@ -182,7 +182,7 @@ class DenseOnTable(TableNetwork, DenseInNumpy):
 
     Args:
         table: the observations.
-        num_actions: A.
+        num_actions: A, of how many to choose.
         hidden: units of each hidden layer.
     """
 

@@ -35,7 +35,7 @@ class DoorEnv(gym.Env):
         friction: of the hinge, in N m: the domain.
         params: the door; without it, a random one is drawn at the first reset and at every reset
             with a seed. The seed also decides how episodes begin.
-        max_steps: T.
+        max_steps: the horizon T.
         timestep: in s; an action lasts for 0.02 s, whatever it is.
         render_mode: ``rgb_array`` or none.
         draw: from a door to what makes its pictures; ``rgb_array`` needs it.

@@ -101,7 +101,7 @@ def chain(variant: str, scale: float, weights: Sequence[np.ndarray], reverse: bo
         variant: three letters. F: all observed, W2 = W3 = 0 and W1 = 1; P: partially, random W.
             O: homoskedastic, s = 1 and t = e; E: heteroskedastic, s = e and t = 1.
             U or S: seen as they are, or scrambled (by the caller).
-        scale: e.
+        scale: the factor e.
         weights: W1, W2, W3.
         reverse: turn the sign of everything that X2 follows.
 
