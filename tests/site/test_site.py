@@ -8,7 +8,7 @@ import zipfile
 from urllib.parse import urldefrag, urlsplit
 
 import pytest
-from browse import PHONE, Visit, new_context, open_page, visit
+from browse import PHONE, WIDE_TABLES, Visit, new_context, open_page, visit
 
 import archive
 import printing
@@ -159,6 +159,18 @@ def test_no_table_scrolls(visits):
 
 def test_no_table_scrolls_on_a_phone(phone_visits):
     assert wide_tables(phone_visits) == {}
+
+
+@pytest.mark.parametrize("width", [620, 768, 970, 1200, 1300, 1390])
+def test_no_table_scrolls_beside_the_sidebars(browser, built_site, page_names, width):
+    """Between a phone and a wide screen the column of text is narrow for other reasons."""
+    found = {}
+    with new_context(browser, {"width": width, "height": 900}) as context:
+        page = context.new_page()
+        for name in page_names:
+            open_page(page, f"{built_site.as_uri()}/{name}")
+            found[name] = page.evaluate(WIDE_TABLES)
+    assert {name: tables for name, tables in found.items() if tables} == {}
 
 
 SMALL_LETTERS = 9.6  # points
