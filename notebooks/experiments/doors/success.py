@@ -237,5 +237,5 @@ EXPERIMENTS = {
     "gaps": door_players.EXPERIMENT,
 } | {
     name: Experiment(evaluate, Cell, short, (0,), reads, runs_at_once=1)
-    for name in ("success", "last", "alone")
+    for name in ("success", "controls", "last", "alone")
 }
