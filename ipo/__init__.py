@@ -8,6 +8,7 @@ An evening's reading, in this order:
     lqr_learners    the four methods of the paper's LQR tables, as that game
     distributions   what a network's outputs say of actions
     networks        policies and critics, and the average of several players' outputs
+    network_players players whose outputs are averaged: how each takes a step
     rollouts        experience in many environments at once, and advantages
     ppo             PPO, IPO and the ensemble: that game between networks
 
@@ -36,6 +37,7 @@ __all__ = [
     "game",
     "lqr",
     "lqr_learners",
+    "network_players",
     "networks",
     "notebooks",
     "optimizers",

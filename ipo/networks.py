@@ -175,17 +175,6 @@ def copied(players: Sequence[Weights]) -> list[Weights]:
     return [{name: w.detach().clone() for name, w in player.items()} for player in players]
 
 
-def in_one_row(weights: Weights) -> tuple[Tensor, Weights]:
-    """A copy with all weights of a run in one row ``[R, P]``, and its parts by name.
-
-    They share their memory, so an optimiser has one tensor to move instead of many.
-    """
-    row = torch.cat([w.flatten(1) for w in weights.values()], 1)
-    parts = row.split([w[0].numel() for w in weights.values()], 1)
-    named = zip(weights.items(), parts, strict=True)
-    return row, {name: part.unflatten(1, w.shape[1:]) for (name, w), part in named}
-
-
 def dense(weights: Weights, name: str, x: Tensor) -> Tensor:
     """A layer by name: ``x [R, B, inputs] -> [R, B, units]``."""
     return torch.baddbmm(weights[f"{name}.bias"].unsqueeze(1), x, weights[f"{name}.weight"])

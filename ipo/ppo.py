@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import reduce
 from typing import Annotated, Any
 
 import numpy as np
@@ -30,8 +29,8 @@ from ipo.checks import (
 )
 from ipo.distributions import Distribution, Generators
 from ipo.game import Move, moves, play_round
-from ipo.networks import Network, Outputs, PullBack, Weights, chosen_rows, in_one_row
-from ipo.optimizers import clip_gradient
+from ipo.network_players import NetworkPlayers
+from ipo.networks import Network, Weights, chosen_rows
 from ipo.rollouts import Collector, Device, Environments, Rollout, TimeOuts
 
 METHODS = ("ppo", "ipo", "ensemble", "in_turn")
@@ -143,6 +142,11 @@ class PPOSettings:
             )
         return size
 
+    def optimizer(self, weights: Tensor) -> torch.optim.Optimizer:
+        """Of weights that move together."""
+        rate, epsilon = self.learning_rate, self.adam_epsilon
+        return torch.optim.Adam([weights], rate, eps=epsilon, fused=True)
+
     @checked
     def collector(self, environments: Environments, device: Device = "cpu") -> Collector:
         """Of a player in its environments."""
@@ -163,10 +167,8 @@ class Training:
         device: where networks act and learn, such as ``cuda``; environments are on the CPU.
 
     Attributes:
+        learners: the players' weights and optimisers.
         players: weights of every player; they change in place.
-        parts: what moves at a time: each player's own weights; last Phi's, where it is variable,
-            which are in all players.
-        rows: the same memory as one ``[R, P]`` for each part, which the optimisers move.
         moves: of a round: who moves, on which domains.
         collectors: the environments of every move, last Phi's.
         num_frames: seen so far, in each run.
@@ -194,43 +196,28 @@ class Training:
             owned.append(list(range(num_domains)))
         for own in copies:
             settings.size_of_minibatches(settings.num_steps * sum(own))
-        if settings.variable_phi and not network.phi:
-            raise ValueError("variable_phi = True: needs a network that has a phi")
         streams = [np.random.SeedSequence(seed).spawn(3) for seed in seeds]
         self.draws, self.resets, self.orders = (
             [np.random.default_rng(stream[i]) for stream in streams] for i in range(3)
         )
         self.network, self.settings, self.num_frames = network, settings, 0
-        self._start(device)
-        self.optimizers = [
-            torch.optim.Adam([own], settings.learning_rate, eps=settings.adam_epsilon, fused=True)
-            for own in self.rows
-        ]
+        num_players = 1 + max(move.player for move in self.moves)
+        starts = [network.start(self.draws) for _ in range(num_players)]
+        self.learners = NetworkPlayers(
+            network,
+            [{name: weight.to(device) for name, weight in own.items()} for own in starts],
+            settings.optimizer,
+            settings.variable_phi,
+        )
         environments = [
             make_environments(domains, own, self.resets)
             for domains, own in zip(owned, copies, strict=True)
         ]
         self.collectors = [settings.collector(own, device) for own in environments]
 
-    def _start(self, device: Device) -> None:
-        """Draw all players, as ever; what they share is that of the first."""
-        num_players = 1 + max(move.player for move in self.moves)
-        drawn = [self.network.start(self.draws) for _ in range(num_players)]
-        drawn = [{name: w.to(device) for name, w in own.items()} for own in drawn]
-        names = list(drawn[0])
-        shared = self.network.phi if self.settings.variable_phi else ()
-        phi = [name for name in names if name.split(".")[0] in shared]
-        parts = [{name: own[name] for name in names if name not in phi} for own in drawn]
-        self.movers = [[d] for d in range(num_players)]  # players of whom a part is a part
-        if phi:
-            parts.append({name: drawn[0][name] for name in phi})
-            self.movers.append(list(range(num_players)))
-        self.rows, self.parts = map(list, zip(*map(in_one_row, parts), strict=True))
-        common = self.parts[-1]
-        self.players = [
-            {name: (common if name in phi else own)[name] for name in names}
-            for own in self.parts[:num_players]
-        ]
+    @property
+    def players(self) -> list[Weights]:
+        return self.learners.players
 
     def reports(self) -> Iterator[tuple[int, list[Weights]]]:
         """Train to the end: ``(num_frames, players)`` now and after each update.
@@ -262,7 +249,7 @@ class Training:
 
     def _learn(self, move: int, part: int) -> None:
         """Collect in the environments of a move, and improve a part."""
-        average, distribution = self.network.frozen(self.players), self.network.distribution
+        average, distribution = self.learners.acting(), self.network.distribution
         rollout = self.collectors[move].collect(average, distribution, self.draws)
         self.num_frames += rollout.values[0].numel()
         self.improve(part, self._frames(move, rollout))
@@ -271,77 +258,22 @@ class Training:
         """What is learned from, ``[R, F]``."""
         return rollout.frames()
 
-    def improve(self, d: int, frames: Rollout) -> None:
-        """Some epochs of PPO for part d on frames ``[R, F]``, while all others stand still.
-
-        A player sees its own outputs only through the average, so they carry the factor 1 / E.
-        """
-        settings, share = self.settings, 1 / len(self.players)
-        others = self._others(d, frames.observations)
+    def improve(self, part: int, frames: Rollout) -> None:
+        """Some epochs of PPO for a part on frames ``[R, F]``, while all others stand still."""
+        settings, learners = self.settings, self.learners
+        others = learners.others(part, frames.observations)
         if settings.normalize_advantages == "rollout":
             frames = frames._replace(advantages=standardize(frames.advantages))
         for epoch in range(settings.num_epochs):
             skip = settings.skip_last_frames and epoch % 2 == 1
             for batch, rest in minibatches(frames, others, settings, self.orders, skip):
-                (parameters, values), pull_back = self._vjp(d, batch.observations)
-                parameters, values = share * parameters, share * values
-                if rest:
-                    parameters, values = rest[0] + parameters, rest[1] + values
-                slopes = self._slopes(parameters, values, batch)
-                self._descend(d, pull_back(*(share * slope for slope in slopes)))
+                outputs, pull_back = learners.vjp(part, batch.observations, rest)
+                slopes = pull_back(*self._slopes(*outputs, batch))
+                learners.step(part, slopes, settings.max_gradient_norm)
 
     def _slopes(self, parameters: Tensor, values: Tensor, batch: Rollout) -> tuple[Tensor, Tensor]:
         """Of the loss in the average's outputs."""
         return loss_gradient(self.network.distribution, parameters, values, batch, self.settings)
-
-    def _vjp(self, d: int, observations: Tensor) -> tuple[Outputs, PullBack]:
-        """Sums of the outputs that part d has a part in; from their slopes to those in its weights.
-
-        Phi has a part in all players' outputs, so its slopes are the sum over players.
-        """
-        found = [self._vjp_of_player(self.players[e], observations) for e in self.movers[d]]
-        outputs, pull_backs = zip(*found, strict=True)
-        names, own = list(self.players[0]), self.parts[d]
-
-        def pull_back(*slopes: Tensor) -> list[Tensor]:
-            by_player = zip(*(back(*slopes) for back in pull_backs), strict=True)
-            return [
-                reduce(torch.add, slopes)
-                for name, slopes in zip(names, by_player, strict=True)
-                if name in own
-            ]
-
-        parameters, values = (reduce(torch.add, each) for each in zip(*outputs, strict=True))
-        return (parameters, values), pull_back
-
-    def _vjp_of_player(self, player: Weights, observations: Tensor) -> tuple[Outputs, PullBack]:
-        return self.network.vjp(player, observations)
-
-    def _others(self, d: int, observations: Tensor) -> list[Tensor]:
-        """What the others contribute to the average; nothing where there are none."""
-        others = [player for e, player in enumerate(self.players) if e not in self.movers[d]]
-        if not others:
-            return []
-        share = 1 / len(self.players)
-        return [(1 - share) * part for part in self.network.frozen(others)(observations)]
-
-    def _descend(self, d: int, gradients: list[Tensor]) -> None:
-        in_rows = torch.cat([gradient.flatten(1) for gradient in gradients], 1)
-        self.rows[d].grad = clip_gradient(in_rows, self.settings.max_gradient_norm)
-        self.optimizers[d].step()
-
-    @torch.no_grad()
-    def set_players(self, players: Sequence[Weights]) -> None:
-        """Go on from other weights; what the optimisers remember stays."""
-        have, want = (
-            [{name: weight.shape for name, weight in player.items()} for player in of]
-            for of in (players, self.players)
-        )
-        if have != want:
-            raise ValueError(f"players: of shapes {have}, must be {want}")
-        for own, weights in zip(self.players, players, strict=True):
-            for name, weight in own.items():
-                weight.copy_(weights[name])
 
     def state(self) -> dict[str, Any]:
         """All that changes, as a tree of tensors and plain values; environments must have one.
@@ -350,8 +282,7 @@ class Training:
         """
         return {
             "num_frames": self.num_frames,
-            "players": self.players,
-            "optimizers": [list(own.state_dict()["state"].values()) for own in self.optimizers],
+            **self.learners.state(),
             "generators": [g.bit_generator.state for g in self._generators()],
             "collectors": [own.state() for own in self.collectors],
         }
@@ -360,17 +291,10 @@ class Training:
         """Go on from ``state()``.
 
         Raises:
-            ValueError: a state of other weights, or of a version that kept moments for each weight.
+            ValueError: see :meth:`ipo.network_players.NetworkPlayers.restore`.
         """
-        for row, moments in zip(self.rows, state["optimizers"], strict=True):
-            shapes = [tuple(own["exp_avg"].shape) for own in moments]
-            if shapes not in ([], [row.shape]):  # the fused Adam would read beyond their ends
-                raise ValueError(f"state: has moments of shapes {shapes}, must be {[row.shape]}")
+        self.learners.restore(state)
         self.num_frames = state["num_frames"]
-        self.set_players(state["players"])
-        for optimizer, moments in zip(self.optimizers, state["optimizers"], strict=True):
-            groups = optimizer.state_dict()["param_groups"]
-            optimizer.load_state_dict({"state": dict(enumerate(moments)), "param_groups": groups})
         for generator, own in zip(self._generators(), state["generators"], strict=True):
             generator.bit_generator.state = own
         for collector, own in zip(self.collectors, state["collectors"], strict=True):

@@ -41,6 +41,7 @@ from ipo import game, lqr, lqr_learners, optimizers, own_domains, ppo, rollouts,
 from ipo.causality import icp, predictors, regressions, scm, small_games
 from ipo.dense_in_numpy import DenseInNumpy
 from ipo.distributions import Categorical
+from ipo.network_players import NetworkPlayers
 from ipo.networks import DenseNetwork, copied
 from ipo.own_domains import copies, networks
 from ipo.own_domains import policy as policies
@@ -313,6 +314,14 @@ def rows_of_learning() -> Iterator[Row]:
         yield row(function, {"num_domains": 2})
     yield row(settings.size_of_minibatches, {"num_frames": 8})
     yield row(settings.collector, {"environments": environments})
+    starts = [dense.start(generators)]
+    yield row(
+        NetworkPlayers,
+        {"network": dense, "starts": starts, "optimizer": settings.optimizer},
+        network=OBJECT,
+        starts=LIST + bad("kind of object", [3]),
+        optimizer=FUNCTION,
+    )
     training = {"network": dense, "make_environments": never, "num_domains": 2}
     yield row(
         ppo.Training,
@@ -325,7 +334,7 @@ def rows_of_learning() -> Iterator[Row]:
     yield row(begun.update, only=WHOLE + bad("range", -1, 2))
     weights = copied(begun.players)
     others = bad("shape", weights[:1], [dense.start(generators)] * 2, [weights[0], {}])
-    yield row(begun.set_players, {"players": weights}, players=others)
+    yield row(begun.learners.set, {"players": weights}, players=others)
 
     yield from rows_of_own_domains(make)
 
@@ -747,7 +756,7 @@ TRUSTING = {
     r"ipo\.lqr\.(LQR\.to|split_domains)": "torch's own conversion and view, by a new name",
     r"ipo\.lqr_learners\.Learner": RECORD,
     r"ipo\.(worlds\.)?networks\.\w+\.(__call__|after_pooling|vjp)": LOOP,
-    r"ipo\.networks\.(averaged|chosen_rows|dense|in_one_row|Tanh.*)": LOOP,
+    r"ipo\.networks\.(averaged|chosen_rows|dense|Tanh.*)": LOOP,
     r"ipo\.dense_in_numpy\.(DenseInNumpy|DenseInNumpy\.vjp)": "as in ipo.networks",
     r"ipo\.worlds\.networks\.TableNetwork\.average": "that of OnTable and DenseOnTable",
     r"ipo\.worlds\.networks\.OnTable\.start": "hands on what it is given",
@@ -759,9 +768,10 @@ TRUSTING = {
     r"ipo\.own_domains\.networks\.(\w+\.(__call__|frozen|vjp)|VectorNetwork)": "as in ipo.networks",
     r"ipo\.rollouts\.check_device": "is a check itself; Training shows it",
     r"ipo\.own_domains\.default_settings": "PPOSettings checks",
-    r"ipo\.ppo\.Training\.(respond|improve)": LOOP,
+    r"ipo\.network_players\.(in_one_row|NetworkPlayers\.(others|vjp|step))": LOOP,
+    r"ipo\.ppo\.(PPOSettings\.optimizer|Training\.(respond|improve))": LOOP,
     r"ipo\.ppo\.(minibatches|loss_gradient|gains|standardize)": LOOP,
-    r"ipo\.(ppo|rollouts|worlds\.vector_environments)\.\w+\.restore": STATE,
+    r"ipo\.(ppo|network_players|rollouts|worlds\.vector_environments)\.\w+\.restore": STATE,
     r"ipo\.rollouts\.(Step|Rollout)": RECORD,
     r"ipo\.(stats\.Difference|game\.Move)": RECORD,
     r"ipo\.worlds\.vector_environments\.FromGymnasium\.step": LOOP,

@@ -13,7 +13,8 @@ from torch import Tensor
 
 from experiments.policies import load_policy, save_policy
 from ipo.distributions import Categorical
-from ipo.networks import DenseNetwork, Network, Weights, copied, in_one_row
+from ipo.network_players import in_one_row
+from ipo.networks import DenseNetwork, Network, Weights, copied
 from ipo.worlds.networks import DenseOnTable, GridNetwork, OnTable
 
 

@@ -244,9 +244,9 @@ def test_players_share_phi_where_it_is_variable_and_nothing_else(pair):
 def test_only_the_part_whose_turn_it_is_moves(part):
     settings = PPOSettings("ipo", minibatch_size=8, num_steps=6, variable_phi=True)
     training = in_training(settings, num_players=2)
-    before = [row.clone() for row in training.rows]
+    before = [row.clone() for row in training.learners.rows]
     training.improve(part, random_frames().frames())
-    moved = [not torch.equal(*rows) for rows in zip(before, training.rows, strict=True)]
+    moved = [not torch.equal(*rows) for rows in zip(before, training.learners.rows, strict=True)]
     assert moved == [number == part for number in range(3)]
 
 
@@ -739,7 +739,7 @@ def test_every_second_epoch_leaves_out_the_last_frames(num_epochs):
 
     norms: list[float] = []
     training = in_training(settings)
-    training.optimizers[0] = Watched([training.rows[0]], 1e-9)
+    training.learners.optimizers[0] = Watched([training.learners.rows[0]], 1e-9)
     training.improve(0, rollout.frames())
     assert [norm > 0 for norm in norms] == [True, False, True, False][:num_epochs]
 

@@ -154,7 +154,7 @@ def test_players_with_unequal_rollouts_make_the_same_number_of_steps():
     assert settings.size_of_minibatches(1 * 16) == 2
     training = trainings(settings)
     training.update()
-    steps = [own.state_dict()["state"][0]["step"].item() for own in training.optimizers]
+    steps = [own.state_dict()["state"][0]["step"].item() for own in training.learners.optimizers]
     assert steps == [8 * settings.num_epochs] * 2
     assert training.num_frames == 4 * 16
 
@@ -241,7 +241,7 @@ def test_a_round_is_a_move_of_every_player_in_turn():
 def test_training_goes_on_from_other_players():
     settings = PPOSettings("ipo", **SMALL)
     training, other = trainings(settings), trainings(settings, (2, 3))
-    training.set_players(other.players)
+    training.learners.set(other.players)
     assert torch.equal(flat(training), flat(other))
     training.update()
     assert not torch.equal(flat(training), flat(other))

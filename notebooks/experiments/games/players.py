@@ -109,7 +109,7 @@ def _alone(training: Training, d: int, num_updates: int) -> list[Weights]:
             before = copied(training.players)
             training.update(only=e)
             if e != d:
-                training.set_players(before)
+                training.learners.set(before)
     return training.players
 
 

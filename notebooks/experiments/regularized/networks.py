@@ -81,11 +81,13 @@ class RegularizedTraining(Training):
         self.dropouts = [
             np.random.default_rng(np.random.SeedSequence(s).spawn(4)[3]) for s in seeds
         ]
+        if settings.dropout:
+            network = Thinned(network, settings.dropout, self.dropouts)
         super().__init__(network, make_environments, num_domains, settings, seeds)
         self.sizes = [
             [settings.num_steps * number for number in own] for own in settings.copies(num_domains)
         ]
-        for optimizer in self.optimizers:
+        for optimizer in self.learners.optimizers:
             (group,) = optimizer.param_groups
             group |= {"weight_decay": settings.weight_decay, "decoupled_weight_decay": True}
 
@@ -95,7 +97,7 @@ class RegularizedTraining(Training):
             factors = variance_factors(frames.returns, sizes, settings.variance_penalty)
             frames = frames._replace(advantages=factors * frames.advantages)
         if settings.scale_penalty:
-            parameters, _ = self.network.frozen(self.players)(frames.observations)
+            parameters, _ = self.learners.acting()(frames.observations)
             slopes = frames.log_probabilities + self.network.distribution.entropy(parameters)
             factors = scale_factors(slopes, frames.advantages, sizes, settings.scale_penalty)
             frames = Penalized(*frames, factors)
@@ -108,13 +110,6 @@ class RegularizedTraining(Training):
                 self.network.distribution, parameters, batch, self.settings
             )
         return of_parameters, of_values
-
-    def _vjp_of_player(self, player: Weights, observations: Tensor) -> tuple[Outputs, PullBack]:
-        probability = self.settings.dropout
-        if not probability:
-            return super()._vjp_of_player(player, observations)
-        factors = dropout_factors(self.network, player, probability, self.dropouts)
-        return vjp_with_dropout(self.network, player, observations, factors)
 
     def _generators(self) -> list[np.random.Generator]:
         return [*super()._generators(), *self.dropouts]
@@ -209,6 +204,25 @@ def _for_frames(x: Tensor, sizes: Sequence[int]) -> Tensor:
 
 
 # -------------------------------------------------------------------------------- dropout
+
+
+class Thinned(Network):
+    """A network that acts with all inputs of its layers, and learns without some of them."""
+
+    def __init__(self, network: Network, probability: float, generators: Generators) -> None:
+        self.network, self.probability, self.generators = network, probability, generators
+        self.distribution, self.phi, self.shapes = network.distribution, network.phi, network.shapes
+        self.start, self.frozen = network.start, network.frozen
+
+    def _draw(self, generator: np.random.Generator) -> dict[str, np.ndarray]:
+        return self.network._draw(generator)
+
+    def __call__(self, weights: Weights, observations: Tensor) -> Outputs:
+        return self.network(weights, observations)
+
+    def vjp(self, weights: Weights, observations: Tensor) -> tuple[Outputs, PullBack]:
+        factors = dropout_factors(self.network, weights, self.probability, self.generators)
+        return vjp_with_dropout(self.network, weights, observations, factors)
 
 
 def dropout_factors(
