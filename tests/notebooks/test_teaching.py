@@ -100,11 +100,14 @@ def test_right_answers_have_no_favourite_place():
 # ------------------------------------------------------------------------------ pages
 
 
-def test_the_names_in_the_table_of_notation_exist():
-    table = (ROOT / "book" / "how_to_read.md").read_text(encoding="utf-8").split("(notation)=")[1]
-    names = re.findall(r"`(ipo(?:\.\w+)+)`", table)
-    assert names
-    assert [name for name in names if not exists(name)] == []
+def test_names_of_code_in_the_prose_exist():
+    pages = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "book").glob("*.md")]
+    prose = "\n".join(page.read_text(encoding="utf-8") for page in pages)
+    for path in (ROOT / "notebooks").glob("*.ipynb"):
+        prose += "\n".join(cells(nbformat.read(path, as_version=4), ""))
+    names = set(re.findall(r"`((?:ipo|experiments)(?:\.\w+)+)`", prose))
+    assert len(names) > 30
+    assert [name for name in sorted(names) if not exists(name)] == []
 
 
 def exists(name: str) -> bool:
