@@ -8,9 +8,10 @@ from pathlib import Path
 from urllib.parse import urldefrag
 
 from bs4 import BeautifulSoup, Tag
-from playwright.sync_api import Page, sync_playwright
+from playwright.sync_api import Error, Page, sync_playwright
 from pypdf import PdfReader
 
+from messages import BuildError
 from profiles import read_yaml, toc_entries
 
 NAME = "book.pdf"
@@ -44,15 +45,21 @@ def print_book(html: Path, root: Path) -> None:
     names = [name for name in listed if name not in LEFT_OUT]
     together = html / "together.html"
     together.write_text(str(joined(html, names)), encoding="utf-8")
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=program, args=["--no-sandbox"])
-        page = browser.new_page()
-        page.set_default_timeout(MOST_SECONDS * 1000)
-        page.goto(together.resolve().as_uri(), wait_until="load")
-        write_pdf(page, html / NAME)
-        page.evaluate(NUMBER_CONTENTS, page_numbers(html / NAME))
-        write_pdf(page, html / NAME)
-        browser.close()
+    try:
+        with sync_playwright() as playwright:
+            browser = playwright.chromium.launch(executable_path=program, args=["--no-sandbox"])
+            page = browser.new_page()
+            page.set_default_timeout(MOST_SECONDS * 1000)
+            page.goto(together.resolve().as_uri(), wait_until="load")
+            write_pdf(page, html / NAME)
+            page.evaluate(NUMBER_CONTENTS, page_numbers(html / NAME))
+            write_pdf(page, html / NAME)
+            browser.close()
+    except Error as error:
+        raise BuildError(
+            f"{program} could not print the book; the last good site is untouched. It said:\n"
+            f"{error.message}"
+        ) from error
     together.unlink()
 
 

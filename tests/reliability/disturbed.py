@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 from faults import HELD, Job, differs, ended, kill, killed, said, start, wait, whole
-from jobs import Build, DoorTraining, Reproduce, Sweep, left
+from jobs import Build, DoorTraining, Printing, Reproduce, Sweep, left
 
 from chapters import tree_hash
 
@@ -169,6 +169,10 @@ KINDS = {
         ("SIGTERM", "build", 3, of(Build, terminated)),
         ("SIGTERM", "`reproduce`", 3, of(Reproduce, terminated)),
     ],
+    "printing": [
+        ("`kill -9`", "PDF of the book", 20, of(Printing, killed)),
+        ("SIGTERM", "PDF of the book", 10, of(Printing, terminated)),
+    ],
     "two at once": [
         ("two at once", "sweep", 4, of(Sweep, twice)),
         ("two at once", "build", 2, of(Build, twice)),
@@ -177,6 +181,7 @@ KINDS = {
     "disks": [
         ("full disk", "sweep", 8, on_disk(Sweep, on_full_disk)),
         ("full disk", "training", 4, on_disk(DoorTraining, on_full_disk)),
+        ("full disk", "build", 4, on_disk(Build, on_full_disk)),
         ("read-only disk", "sweep", 4, on_disk(Sweep, on_read_only_disk)),
         ("read-only disk", "training", 2, on_disk(DoorTraining, on_read_only_disk)),
     ],

@@ -1,4 +1,4 @@
-"""The jobs that faults hit: a sweep, a training, a build and ``experiments.reproduce``."""
+"""The jobs that faults hit: a sweep, a training, a build, its PDF and ``experiments.reproduce``."""
 
 from __future__ import annotations
 
@@ -13,10 +13,12 @@ import pytest
 import toy_chapter
 import toy_experiment
 from faults import whole
+from pypdf import PdfReader
 from toy_book import CELLS, in_toy, write_notebook, write_toy
 from toy_experiment import Cell
 
 import build
+import printing
 from chapters import tree_hash
 from experiments.checkpoints import load_checkpoint
 from experiments.doors import training
@@ -155,6 +157,26 @@ class Build:
         site = tree_hash(self.site)
         good = "the complete one" if site == self.complete[self.state] else site
         return good, left(self.folder / "book")
+
+
+class Printing:
+    """The PDF of a toy book, by a browser, which must end with the build."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.site = folder, Build(folder).site
+
+    def begin(self) -> None:
+        (self.site / printing.NAME).unlink(missing_ok=True)
+
+    def run(self) -> None:
+        interrupt_on_sigterm()
+        printing.print_book(self.site, self.folder)
+
+    def seen(self) -> set[str]:
+        return set()
+
+    def result(self) -> tuple:
+        return len(PdfReader(self.site / printing.NAME).pages), left(self.folder / "book")
 
 
 class Reproduce:

@@ -9,6 +9,7 @@ from bs4 import BeautifulSoup
 
 import archive
 import first_page
+import messages
 import printing
 from finish.access import make_accessible
 from finish.equations import set_equations
@@ -208,6 +209,18 @@ def test_without_chromium_there_is_no_pdf_and_a_word_about_it(tmp_path, monkeypa
     printing.print_book(tmp_path, tmp_path)
     assert "no Chromium" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
+
+
+def test_a_chromium_that_does_not_work_is_an_error_with_its_words(tmp_path, monkeypatch):
+    program = tmp_path / "chromium"
+    program.write_text("#!/bin/sh\necho no such display >&2\nexit 3\n")
+    program.chmod(0o755)
+    monkeypatch.setattr(printing, "chromium", lambda: str(program))
+    (tmp_path / "_toc.yml").write_text("format: jb-book\nroot: intro\n")
+    page = "<html><body><article class='bd-article'><h1>Title</h1></article></body></html>"
+    (tmp_path / "intro.html").write_text(page)
+    with pytest.raises(messages.BuildError, match=r"(?s)chromium could not print.*no such display"):
+        printing.print_book(tmp_path, tmp_path)
 
 
 def test_the_first_sentences_follow_the_verdicts(monkeypatch):
