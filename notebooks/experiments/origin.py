@@ -51,7 +51,11 @@ def versions() -> dict[str, str]:
 
 
 def machine() -> str:
-    return f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores"
+    """Its instruction set is the one that torch found, which decides how numbers are rounded."""
+    import torch  # who only reads rows needs it not
+
+    kind = f"{platform.machine()} {torch.backends.cpu.get_cpu_capability()}"
+    return f"{platform.system()} {kind}, {os.cpu_count()} cores"
 
 
 def _git(*arguments: str) -> str:
