@@ -30,8 +30,13 @@ from experiments.tensors import read_tensors
 
 ROOT = Path(__file__).resolve().parents[2]
 EMPTY = "EXPERIMENTS, CELLS = {}, ()\n"
+# What the registry imports.
 CHAPTERS = dict.fromkeys(
-    ["causality.py", "keys.py", "own_domains.py", "doors/success.py", "games/scalar.py"], EMPTY
+    [
+        *("causality.py", "keys.py", "keys_labels.py", "own_domains.py", "cue/training.py"),
+        *("doors/success.py", "games/scalar.py", "regularized/linear.py", "regularized/trials.py"),
+    ],
+    EMPTY,
 ) | {"lqr.py": "from toy_chapter import EXPERIMENTS\n"}
 UNFINISHED = (".tmp", ".new", ".running")  # in the names of files that are being written
 

@@ -8,8 +8,8 @@ import count_faults
 import numpy as np
 import pytest
 from damaged import flipped
-from faults import HARMLESS, HELD, killed
-from jobs import Sweep
+from faults import HARMLESS, HELD, killed, whole
+from jobs import Reproduce, Sweep
 
 from experiments.files import replace_text
 
@@ -36,6 +36,11 @@ def test_nothing_is_lost(kind):
 
 def test_a_killed_sweep_loses_nothing(tmp_path, generator):
     assert killed(Sweep(tmp_path / "sweep"), generator, 2) == [HELD, HELD]
+
+
+def test_a_reproduction_beside_a_toy_record_runs(tmp_path):
+    job = Reproduce(tmp_path / "job")
+    assert len(whole(job)) == 2 * len(job.cells) * len(job.seeds)
 
 
 class Steps:

@@ -93,8 +93,7 @@ def test_arms_are_two_trainings_at_two_times():
 
 
 def test_controls_are_trained_as_long_as_ipo_as_published():
-    declared = door_training.controls()
-    assert controls(190, 4096) == {arm: declared[arm] for arm in ("ensemble", "in_turn")}
+    assert controls(190, 4096) == door_training.controls()
     assert {*controls(4, 512)} == {*CONTROLS} - {"ppo_half"}
     for cell in controls(4, 512).values():
         assert (cell.settings.num_updates, cell.saved_after) == (2, (2,))
@@ -143,10 +142,11 @@ def test_controls_are_paired_with_the_runs_of_ipo_that_they_have(success):
     opened = {0: 0.25, 1: 0.5}
     rows = of_ppo.assign(method="in_turn", value=of_ppo["run"].map(opened))
     of_ensemble = rows.assign(method="ensemble", value=rows["value"] + 0.25)
-    every = pd.concat([success, rows, of_ensemble])
+    of_faster_ipo = rows.assign(method="ipo_lr1e-3", value=rows["value"] - 0.25)
+    every = pd.concat([success, rows, of_ensemble, of_faster_ipo])
     table = door_tables.controlled(every, arms, FRICTIONS, effect=10.0)
-    assert list(table["pairs"]) == [3, 2, 2]
-    assert list(table["difference"]) == pytest.approx([100 / 3, 12.5, -12.5])
+    assert list(table["pairs"]) == [3, 2, 2, 2]
+    assert list(table["difference"]) == pytest.approx([100 / 3, 12.5, -12.5, 37.5])
     assert list(table["it opens"])[1] == "37.5 ± 12.5"
     assert table["power"].between(0.05, 1).all()
 
