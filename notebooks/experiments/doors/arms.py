@@ -26,6 +26,7 @@ CONTROLS = {
     "ppo_half": "PPO",
     "in_turn": "one network, one domain at a time",
     "ensemble": "ensemble, all doors for both networks",
+    "ipo_lr1e-3": "IPO with PPO's learning rate",
 }  # as long as IPO as published was trained
 PUBLISHED = ("ppo", "ipo_half")  # with the steps of the published runs
 
@@ -47,8 +48,7 @@ def trainings(num_updates: int, num_steps: int) -> dict[str, door_training.Cell]
 def controls(num_updates: int, num_steps: int) -> dict[str, door_training.Cell]:
     """Trainings beside these, until half time: what a difference is due to."""
     every = _curve_every(num_updates)
-    declared = door_training.controls(num_updates // 2, every, **_sizes(num_steps))
-    return {label: cell for label, cell in declared.items() if label in CONTROLS}
+    return door_training.controls(num_updates // 2, every, **_sizes(num_steps))
 
 
 def controls_of(trained: Mapping[str, door_training.Cell], **options: Any) -> dict[str, Cell]:
