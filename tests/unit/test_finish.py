@@ -6,6 +6,7 @@ import zipfile
 
 import pytest
 from bs4 import BeautifulSoup
+from playwright.sync_api import Error
 
 import archive
 import first_page
@@ -212,10 +213,11 @@ def test_without_chromium_there_is_no_pdf_and_a_word_about_it(tmp_path, monkeypa
 
 
 def test_a_chromium_that_does_not_work_is_an_error_with_its_words(tmp_path, monkeypatch):
-    program = tmp_path / "chromium"
-    program.write_text("#!/bin/sh\necho no such display >&2\nexit 3\n")
-    program.chmod(0o755)
-    monkeypatch.setattr(printing, "chromium", lambda: str(program))
+    def refuse():
+        raise Error("no such display")
+
+    monkeypatch.setattr(printing, "chromium", lambda: "chromium")
+    monkeypatch.setattr(printing, "sync_playwright", refuse)
     (tmp_path / "_toc.yml").write_text("format: jb-book\nroot: intro\n")
     page = "<html><body><article class='bd-article'><h1>Title</h1></article></body></html>"
     (tmp_path / "intro.html").write_text(page)

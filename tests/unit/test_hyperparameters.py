@@ -6,7 +6,7 @@ from experiments.keys import Keys, arm
 from experiments.paper import read_paper
 from hyperparameters import SETTINGS, differs, num_frames, num_gradient_steps, ours
 from hyperparameters import tables as page
-from ipo.ppo import Training
+from ipo.network_players import NetworkPlayers
 
 STATED = read_paper("hyperparameters")
 
@@ -48,7 +48,7 @@ def test_gradient_steps_are_counted_as_they_are_taken(tables, monkeypatch, metho
     tiny = {"num_updates": 2, "num_envs": 8, "num_steps": 10, "minibatch_size": 16, "num_epochs": 3}
     own = arm(method, method, **(tiny | shares))
     taken = []
-    monkeypatch.setattr(Training, "_descend", lambda *_: taken.append(1))
+    monkeypatch.setattr(NetworkPlayers, "step", lambda *_: taken.append(1))
     *_, (frames, _) = Keys(tables).train(own, [0])
     assert num_gradient_steps(own.settings, 2) == len(taken)
     assert num_frames(own.settings, 2) == frames
