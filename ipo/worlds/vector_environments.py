@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -18,19 +19,21 @@ class FromGymnasium:
     Args:
         envs: made with ``autoreset_mode=AutoresetMode.SAME_STEP``; observations are arrays.
         num_runs: R; copies r N to (r + 1) N belong to run r.
-        seed: of the first reset; each copy has a random stream of its own.
+        seed: of the first reset, spread over the copies; or one for each of them.
     """
 
-    def __init__(self, envs: VectorEnv, num_runs: int, seed: int) -> None:
+    def __init__(self, envs: VectorEnv, num_runs: int, seed: int | Sequence[int]) -> None:
         mode = envs.metadata.get("autoreset_mode")
         if getattr(mode, "name", None) != "SAME_STEP":  # gymnasium before 1.1 has no modes
             raise ValueError(f"envs: have autoreset_mode = {mode}, must have SAME_STEP")
         if envs.num_envs % num_runs:
             raise ValueError(f"envs: {envs.num_envs} copies, must be a multiple of {num_runs} runs")
         self.envs, self.num_runs = envs, num_runs
-        # Gymnasium's own seeds s, s + 1, ... would give neighbouring runs the same streams.
-        streams = np.random.SeedSequence(seed).spawn(envs.num_envs)
-        self.seeds = [int(stream.generate_state(1)[0]) for stream in streams]
+        if not isinstance(seed, Sequence):
+            # Gymnasium's own seeds s, s + 1, ... would give neighbouring runs the same streams.
+            streams = np.random.SeedSequence(seed).spawn(envs.num_envs)
+            seed = [int(stream.generate_state(1)[0]) for stream in streams]
+        self.seeds = seed
 
     def reset(self) -> Tensor:
         return self._by_run(self.envs.reset(seed=self.seeds)[0])  # type: ignore[arg-type]

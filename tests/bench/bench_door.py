@@ -20,7 +20,7 @@ import torch
 from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
-from experiments.doors.training import NETWORK, new_training, published_door
+from experiments.doors.training import CELLS, NETWORK, new_training
 from experiments.sealed import write_record
 from ipo.worlds.many_doors import VectorDoor
 from ipo.worlds.one_door import DoorEnv
@@ -92,7 +92,7 @@ def simulation(num_steps: int, num_blocks: int) -> dict[str, list[float]]:
 
 def update_costs(method: str) -> dict[str, float]:
     """CPU seconds of a published update: simulation, and what learning costs."""
-    training = new_training(published_door(method), seed=0)
+    training = new_training(CELLS[method], seed=0)
     costs = {"simulation": 0.0, "learning": 0.0}
     for d, collector in enumerate(training.collectors):
         average = NETWORK.frozen(training.players)

@@ -1,5 +1,7 @@
 """Evaluation of policies on doors: the same doors for everyone, and rows as agreed."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -20,6 +22,7 @@ from experiments.doors.training import (
     last_info,
     made_for,
     make_doors,
+    new_training,
     policy_path,
     published_door,
 )
@@ -108,6 +111,26 @@ def test_runs_of_the_same_seed_have_the_same_doors_without_friction():
         return doors.envs.params[:4]
 
     assert first_doors([0, 1], [4, 2]) == first_doors([0], [4])
+
+
+@pytest.mark.parametrize("label", ["ppo_same_doors", "ensemble_same_doors", "in_turn"])
+def test_arms_with_the_same_doors_have_those_of_ipo(label):
+    """Of every domain, in the same order, whoever learns from them; the same starts as well."""
+
+    def doors(label):
+        cell = CELLS[label]
+        settings = replace(cell.settings, num_envs=(4, 2), num_steps=8, num_minibatches=1)
+        training = new_training(replace(cell, settings=settings), seed=3)
+        drawn = []
+        for collector in training.collectors:
+            collector.environments.reset()
+            own = collector.environments.envs
+            drawn += zip(own.params, own.handle_shifts.tolist(), strict=True)
+        return sorted(drawn, key=lambda door: door[0].friction)
+
+    assert doors(label) == doors("ipo")
+    if label != "in_turn":
+        assert doors(label) != doors(label.removesuffix("_same_doors"))
 
 
 def test_the_published_settings():

@@ -26,6 +26,7 @@ from experiments.doors.training import (
     TRAIN_FRICTIONS,
     last_info,
     policy_path,
+    seeds_of,
 )
 from experiments.experiment import Experiment
 from ipo.checks import Count, Natural, NonNegative, check_choice, check_count, checked
@@ -132,8 +133,7 @@ def load_players(cell: Cell, seed: int, policies: str | Path) -> list[Weights]:
 
 def door_seeds(num_doors: int = NUM_DOORS) -> list[int]:
     """Seeds with which ``DoorEnv`` makes the doors of the evaluation, one by one."""
-    streams = np.random.SeedSequence(EVALUATION_SEED).spawn(num_doors)
-    return [int(stream.generate_state(1)[0]) for stream in streams]
+    return seeds_of(np.random.SeedSequence(EVALUATION_SEED), num_doors)
 
 
 def evaluation_doors(num_doors: int = NUM_DOORS) -> pd.DataFrame:

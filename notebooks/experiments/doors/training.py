@@ -71,12 +71,14 @@ class Cell:
         saved_after: the policies are saved after so many updates. A training that ends there
             would be the same: its random streams do not depend on how long it will last.
         curve_every: updates between two looks at a friction that is not trained on.
+        same_doors: the doors are IPO's, whoever learns from them; see :class:`SameDoors`.
     """
 
     label: str
     settings: PPOSettings
     saved_after: tuple[Count, ...] = (95, 190)
     curve_every: Count = 10
+    same_doors: bool = False
 
     def __post_init__(self) -> None:
         check_file_name("label", self.label)  # of policies and check-points
@@ -93,15 +95,18 @@ class Cell:
 
 
 def controls(num_updates: int = 95, curve_every: int = 10, **changes: Any) -> dict[str, Cell]:
-    """Arms that show what a difference between IPO and PPO is due to, with IPO's doors and rate.
+    """Arms that show what a difference between IPO and PPO is due to.
 
     They end where the published training of IPO did: the ensemble, whose players learn from all
-    doors; one network that learns from one domain at a time; IPO with PPO's learning rate.
+    doors; one network that learns from one domain at a time; IPO with PPO's learning rate. The
+    latter two have IPO's doors by themselves; PPO and the ensemble are there with them, too.
     """
     differences = {
-        "ensemble": ("ensemble", 5e-4),
-        "in_turn": ("in_turn", 5e-4),
-        "ipo_lr1e-3": ("ipo", 1e-3),
+        "ensemble": ("ensemble", 5e-4, False),
+        "in_turn": ("in_turn", 5e-4, False),
+        "ipo_lr1e-3": ("ipo", 1e-3, False),
+        "ppo_same_doors": ("ppo", 1e-3, True),
+        "ensemble_same_doors": ("ensemble", 5e-4, True),
     }
     return {
         label: Cell(
@@ -109,8 +114,9 @@ def controls(num_updates: int = 95, curve_every: int = 10, **changes: Any) -> di
             published_door(method, learning_rate=rate, num_updates=num_updates, **changes),
             saved_after=(num_updates,),
             curve_every=curve_every,
+            same_doors=same_doors,
         )
-        for label, (method, rate) in differences.items()
+        for label, (method, rate, same_doors) in differences.items()
     }
 
 
@@ -166,7 +172,7 @@ class Run:
     def __init__(self, cell: Cell, seed: int, checkpoints: Path, policies: Path) -> None:
         self.cell, self.seed, self.policies = cell, seed, policies
         self.checkpoint = checkpoint_path(cell, seed, checkpoints)
-        self.training = new_training(cell.settings, seed)
+        self.training = new_training(cell, seed)
         self.num_updates = 0
         self.cpu_seconds = 0.0
         self.best_return = -np.inf
@@ -271,18 +277,52 @@ class Run:
             setattr(self, name, state[name])
 
 
-def new_training(settings: PPOSettings, seed: int) -> Training:
+def new_training(cell: Cell, seed: int) -> Training:
     """One run of training on doors, from its start."""
-    return Training(NETWORK, make_doors, len(TRAIN_FRICTIONS), settings, [seed])
+    doors = SameDoors() if cell.same_doors else make_doors
+    return Training(NETWORK, doors, len(TRAIN_FRICTIONS), cell.settings, [seed])
 
 
 def make_doors(
     domains: list[int], num_copies: list[int], generators: Sequence[np.random.Generator]
 ) -> FromGymnasium:
-    """Random doors of the training frictions, for the one run that there is."""
+    """Random doors of the training frictions, for the one run that there is.
+
+    A player who owns all domains draws them together, so of the doors of a run and its seed only
+    those of the first domain are IPO's.
+    """
     (generator,) = generators
-    frictions = np.repeat([TRAIN_FRICTIONS[domain] for domain in domains], num_copies)
-    return FromGymnasium(VectorDoor(frictions.tolist()), 1, int(generator.integers(2**63)))
+    return FromGymnasium(_doors(domains, num_copies), 1, int(generator.integers(2**63)))
+
+
+class SameDoors:
+    """As :func:`make_doors` for players with a domain each, and the same doors for all others.
+
+    The doors of a domain have random streams of their own; each player takes the next ones.
+    """
+
+    def __init__(self) -> None:
+        self.streams: list[np.random.SeedSequence] = []
+
+    def __call__(
+        self, domains: list[int], num_copies: list[int], generators: Sequence[np.random.Generator]
+    ) -> FromGymnasium:
+        (generator,) = generators
+        if not self.streams:
+            seeds = [int(generator.integers(2**63)) for _ in TRAIN_FRICTIONS]
+            self.streams = [np.random.SeedSequence(seed) for seed in seeds]
+        taken = zip(domains, num_copies, strict=True)
+        seeds = [own for domain, number in taken for own in seeds_of(self.streams[domain], number)]
+        return FromGymnasium(_doors(domains, num_copies), 1, seeds)
+
+
+def _doors(domains: list[int], num_copies: list[int]) -> VectorDoor:
+    return VectorDoor(np.repeat([TRAIN_FRICTIONS[d] for d in domains], num_copies).tolist())
+
+
+def seeds_of(stream: np.random.SeedSequence, number: int) -> list[int]:
+    """The next seeds of a stream."""
+    return [int(own.generate_state(1)[0]) for own in stream.spawn(number)]
 
 
 def last_info(
