@@ -139,15 +139,16 @@ def test_controls_are_paired_with_the_runs_of_ipo_that_they_have(success):
     """Runs 0 and 1 of the controls, of IPO's three."""
     arms = ARMS | controls_of(controls(4, 512), frictions=FRICTIONS, num_doors=NUM_DOORS)
     of_ppo = success.query("method == 'ppo' and steps == 32768 and run < 2")
-    opened = {0: 0.25, 1: 0.5}
-    rows = of_ppo.assign(method="in_turn", value=of_ppo["run"].map(opened))
-    of_ensemble = rows.assign(method="ensemble", value=rows["value"] + 0.25)
-    of_faster_ipo = rows.assign(method="ipo_lr1e-3", value=rows["value"] - 0.25)
-    every = pd.concat([success, rows, of_ensemble, of_faster_ipo])
-    table = door_tables.controlled(every, arms, FRICTIONS, effect=10.0)
-    assert list(table["pairs"]) == [3, 2, 2, 2]
-    assert list(table["difference"]) == pytest.approx([100 / 3, 12.5, -12.5, 37.5])
-    assert list(table["it opens"])[1] == "37.5 ± 12.5"
+    of_controls = of_ppo.assign(value=of_ppo["run"].map({0: 0.25, 1: 0.5}))
+    more = dict(zip(controls(4, 512), (0.25, 0, -0.25, 0, 0.125, 0.5), strict=True))
+    rows = [of_controls.assign(method=m, value=of_controls["value"] + by) for m, by in more.items()]
+    table = door_tables.controlled(pd.concat([success, *rows]), arms, FRICTIONS, effect=10.0)
+    assert list(table["pairs"]) == [3, 2, 2, 2, 2, 2, 2]
+    differences = table.set_index("key")["difference"]
+    assert differences["ppo_half"] == pytest.approx(100 / 3)
+    for method, by in more.items():
+        assert differences[method] == pytest.approx(12.5 - 100 * by)
+    assert table.set_index("key").loc["in_turn", "it opens"] == "37.5 ± 12.5"
     assert table["power"].between(0.05, 1).all()
 
 
