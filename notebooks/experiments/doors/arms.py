@@ -115,5 +115,6 @@ def percent(values: pd.Series) -> str:
 
 def percent_with_interval(values: pd.Series) -> str:
     """Mean over runs with its 95 % interval."""
-    low, high = mean_interval(100 * values.to_numpy())
-    return f"{100 * values.mean():.1f} [{low:.0f}, {high:.0f}]"
+    values = 100 * values  # before the mean, as in `percent`: they round alike
+    low, high = mean_interval(values.to_numpy())
+    return f"{values.mean():.1f} [{low:.0f}, {high:.0f}]"
