@@ -63,7 +63,7 @@ def maze(data: Path = claims.DATA) -> str:
     )
     return (
         "In {doc}`a maze where domains disagree <cue>`, IPO does better than PPO in "
-        f"{better} cases where theory foretells it, and worse in {worse}."
+        f"{better} cases where theory predicts it, and worse in {worse}."
     )
 
 

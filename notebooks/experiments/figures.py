@@ -150,7 +150,7 @@ def observations(panels: dict[str, np.ndarray], dim_state: int) -> Figure:
         ax.grid(False)
     axes[0, 0].set_ylabel("observation $o_t$")
     middles = {"$W_c s$: state": dim_state / 2}
-    middles["$W_d s$: distractor"] = (dim_state + panel.shape[1]) / 2
+    middles["$D_d s$: distractor"] = (dim_state + panel.shape[1]) / 2
     for text, middle in middles.items():
         axes[0, 0].text(
             0.98, middle, text, ha="right", va="center",

@@ -239,7 +239,7 @@ def _by_run(values: np.ndarray, **columns: Any) -> pd.DataFrame:
     return pd.DataFrame({**columns, "run": runs, "metric": "return_exact", "value": values})
 
 
-PHASES = ("searching the key", "with the key", "door unlocked")
+PHASES = ("searching for the key", "with the key", "door unlocked")
 
 
 def visits(task: Keys, players: Sequence[Weights], color: str) -> np.ndarray:

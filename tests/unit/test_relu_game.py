@@ -74,4 +74,4 @@ def test_ends_are_told_apart():
     assert ends(rows)["rest"].tolist() == [True, True, False, False]
     (line,) = table(rows).to_dict("records")
     assert [line["an equilibrium, optimal"], line["an equilibrium, not optimal"]] == [0.25, 0.25]
-    assert line["no equilibrium"] == 0.5
+    assert line["none reached"] == 0.5

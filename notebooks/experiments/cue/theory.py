@@ -1,4 +1,4 @@
-"""What the votes of domains foretell about the cued maze, before any network is trained.
+"""What the votes of domains predict about the cued maze, before any network is trained.
 
 At the junction two things can be seen: landmark and cue agree, or they do not. With m the strength
 of the landmark, c_d that of the cue in domain d, and A and B the probabilities of going where the

@@ -177,7 +177,7 @@ def shares_table(
 
 @dataclass(frozen=True)
 class Vote:
-    """Bounded players on many regression problems, whose end the theorem foretells.
+    """Bounded players on many regression problems, whose end the theorem predicts.
 
     Attributes:
         num_domains: of each problem; see :func:`voters`.

@@ -174,7 +174,7 @@ def table(rows: pd.DataFrame) -> pd.DataFrame:
     kinds = {
         "an equilibrium, optimal": found["rest"] & found["optimal"],
         "an equilibrium, not optimal": found["rest"] & ~found["optimal"],
-        "no equilibrium": ~found["rest"],
+        "none reached": ~found["rest"],
     }
     by = [
         found["method"].map(NAMES).rename("units"),
