@@ -64,4 +64,6 @@ def full(chapter: str, name: str, batches: list[Batch]) -> str:
 
 
 def commits(names) -> str:
-    return ", ".join(f"`{name[:7]}`" for name in sorted(set(names)))
+    """Short names; a plus stays, which says that the code had changes of its own."""
+    short = {name[:7] + "+" * name.endswith("+") for name in names}
+    return ", ".join(f"`{name}`" for name in sorted(short))

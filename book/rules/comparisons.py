@@ -38,15 +38,18 @@ def means_come_back(
     Within ``num_errors`` standard errors of the difference, or within the rounding of what is
     printed. ``where`` says which rows of a method are meant.
     """
-    good, parts = [], []
+    good, parts, missed = [], [], []
     for cell, mean, std in published(paper):
         ours = cells.runs(metric=metric, **cell, **where[cell["method"]])
         error = np.hypot(std / np.sqrt(num_paper_runs), ours.sem())
         good.append(abs(ours.mean() - mean) <= max(num_errors * error, 0.5 * 10**-digits))
         name = f"{label(cell['method'])} on {cell['domain']}"
         parts.append(f"{name} {ours.mean():.3f} (paper {mean:.{digits}f})")
-    counts = f"{sum(good)} of {len(good)} are reproduced: "
-    return Finding(together(map(holds, good)), counts + "; ".join(parts))
+        if not good[-1]:
+            missed.append(name)
+    counts = f"{sum(good)} of {len(good)} are reproduced"
+    counts += f", not {', '.join(missed)}" if missed else ""
+    return Finding(together(map(holds, good)), f"{counts}: {'; '.join(parts)}")
 
 
 def spreads_come_back(
@@ -75,8 +78,8 @@ def spreads_come_back(
     return Finding(
         together(map(holds, same)),
         f"{sum(same)} of {len(same)} do not differ beyond chance; ours are {min(ratios):.2f} to "
-        f"{max(ratios):.2f} times the paper's, in the middle {np.median(ratios):.2f}, and {near} "
-        "are within a tenth of it",
+        f"{max(ratios):.2f} times the paper's, with median {np.median(ratios):.2f}; {near} within a "
+        "tenth of the paper's",
     )
 
 
@@ -147,8 +150,8 @@ def because_of_the_game(
         f"{label(arm['method'])}{suffix(arm)}" for arm in (method, baseline, *control)
     )
     parts = [
-        f"{ours} is better than {theirs} by {advantage.text()}, and, what is left of it, "
-        f"{controlled} than {left_over} by {left.text()}"
+        f"{ours} minus {theirs}: {advantage.text()}; what is left of it, {controlled} minus "
+        f"{left_over}: {left.text()} (positive where the first does better)"
         for advantage, left in compared
     ]
     if each:

@@ -73,10 +73,10 @@ def significantly_lower(
     verdicts = decided(gains, corrected)
     theirs = paper.set_index(["method", *CONFIGURATION])["mean"]
     own = [theirs[baseline, *size] - theirs[method, *size] for method, baseline, size in arms]
+    lower = [gain for gain, found in zip(gains, verdicts, strict=True) if found == REPRODUCED]
     evidence = (
-        f"significantly lower in {verdicts.count(REPRODUCED)} of {len(arms)} comparisons, by "
-        f"{shown(min(means(gains)))} to {shown(max(means(gains)))} (the paper's own means are "
-        f"lower in {sum(gain > 0 for gain in own)})"
+        f"significantly lower in {len(lower)} of {len(arms)} comparisons{span(lower)} (the paper's "
+        f"own means are lower in {sum(gain > 0 for gain in own)})"
     )
     exceptions = [
         f"{compared(*arm)} by {shown(gain.difference.mean)}, {found}"
@@ -93,6 +93,11 @@ def significantly_lower(
     if opposite:
         evidence += "; of the other sign than in the paper: " + "; ".join(opposite)
     return Finding(together(verdicts), evidence)
+
+
+def span(gains: list[Compared]) -> str:
+    """By how much, from the smallest to the largest mean difference."""
+    return f", by {shown(min(means(gains)))} to {shown(max(means(gains)))}" if gains else ""
 
 
 def no_benefit(
@@ -144,10 +149,10 @@ def overfits(cells: Cells, paper: pd.DataFrame, method: str, corrected: bool) ->
         for size in configurations(paper)
     ]
     verdicts = decided(gaps, corrected)
+    higher = [gap for gap, found in zip(gaps, verdicts, strict=True) if found == REPRODUCED]
     evidence = (
         f"{label(method)} costs significantly more in a new domain than in training in "
-        f"{verdicts.count(REPRODUCED)} of {len(verdicts)} configurations, by "
-        f"{shown(min(means(gaps)))} to {shown(max(means(gaps)))}"
+        f"{len(higher)} of {len(verdicts)} configurations{span(higher)}"
     )
     return Finding(together(verdicts), evidence)
 
