@@ -78,8 +78,8 @@ def spreads_come_back(
     return Finding(
         together(map(holds, same)),
         f"{sum(same)} of {len(same)} do not differ beyond chance; ours are {min(ratios):.2f} to "
-        f"{max(ratios):.2f} times the paper's, with median {np.median(ratios):.2f}; {near} within a "
-        "tenth of the paper's",
+        f"{max(ratios):.2f} times the paper's, with median {np.median(ratios):.2f}; {near} within "
+        "a tenth of the paper's",
     )
 
 
