@@ -72,7 +72,6 @@ class Cell:
             would be the same: its random streams do not depend on how long it will last.
         curve_every: updates between two looks at a friction that is not trained on.
         same_doors: the doors are IPO's, whoever learns from them; see :class:`SameDoors`.
-        hidden: units of each hidden layer.
     """
 
     label: str
@@ -80,7 +79,6 @@ class Cell:
     saved_after: tuple[Count, ...] = (95, 190)
     curve_every: Count = 10
     same_doors: bool = False
-    hidden: tuple[Count, ...] = (64, 64)
 
     def __post_init__(self) -> None:
         check_file_name("label", self.label)  # of policies and check-points
@@ -92,10 +90,6 @@ class Cell:
                 )
 
     @property
-    def network(self) -> DenseInNumpy:
-        return DenseInNumpy(15, 6, Gaussian, self.hidden)
-
-    @property
     def columns(self) -> dict[str, Any]:
         return {"method": self.label, "train_frictions": "+".join(map(str, TRAIN_FRICTIONS))}
 
@@ -105,8 +99,7 @@ def controls(num_updates: int = 95, curve_every: int = 10, **changes: Any) -> di
 
     They end where the published training of IPO did: the ensemble, whose players learn from all
     doors; one network that learns from one domain at a time; IPO with PPO's learning rate. The
-    latter two have IPO's doors by themselves. With the same doors: PPO, PPO with one network of as
-    many weights as IPO's two, and the ensemble.
+    latter two have IPO's doors by themselves; PPO and the ensemble are there with them, too.
     """
 
     def control(label: str, method: str, learning_rate: float, **options: Any) -> Cell:
@@ -120,7 +113,6 @@ def controls(num_updates: int = 95, curve_every: int = 10, **changes: Any) -> di
         control("in_turn", "in_turn", 5e-4),
         control("ipo_lr1e-3", "ipo", 1e-3),
         control("ppo_same_doors", "ppo", 1e-3, same_doors=True),
-        control("ppo_wide_same_doors", "ppo", 1e-3, same_doors=True, hidden=(94, 94)),
         control("ensemble_same_doors", "ensemble", 5e-4, same_doors=True),
     ]
     return {cell.label: cell for cell in cells}
@@ -199,13 +191,7 @@ class Run:
         self.num_updates += 1
         self._note_episodes()
         if self.num_updates % self.cell.curve_every == 0:
-            found = last_info(
-                self.training.players,
-                CURVE_FRICTION,
-                NUM_CURVE_DOORS,
-                CURVE_SEED,
-                self.cell.network,
-            )
+            found = last_info(self.training.players, CURVE_FRICTION, NUM_CURVE_DOORS, CURVE_SEED)
             self._note(CURVE_FRICTION, "success_most_likely", found["opened"].mean())
         self.cpu_seconds += time.process_time() - before
         self._note("training", "cpu_seconds", self.cpu_seconds)
@@ -292,7 +278,7 @@ class Run:
 def new_training(cell: Cell, seed: int) -> Training:
     """One run of training on doors, from its start."""
     doors = SameDoors() if cell.same_doors else make_doors
-    return Training(cell.network, doors, len(TRAIN_FRICTIONS), cell.settings, [seed])
+    return Training(NETWORK, doors, len(TRAIN_FRICTIONS), cell.settings, [seed])
 
 
 def make_doors(
@@ -338,12 +324,7 @@ def seeds_of(stream: np.random.SeedSequence, number: int) -> list[int]:
 
 
 def last_info(
-    players: Sequence[Weights],
-    friction: float,
-    num_doors: int,
-    seed: int,
-    network: DenseInNumpy = NETWORK,
-    **options: Any,
+    players: Sequence[Weights], friction: float, num_doors: int, seed: int, **options: Any
 ) -> dict[str, np.ndarray]:
     """What the players' average makes of fresh doors in one episode, by its most likely actions.
 
@@ -355,7 +336,7 @@ def last_info(
     """
     doors = VectorDoor([friction] * num_doors, **options)
     try:
-        policy = network.frozen(players)
+        policy = NETWORK.frozen(players)
         observations, _ = doors.reset(seed=seed)
         while True:
             rows = torch.tensor(observations, dtype=torch.float32).unsqueeze(0)
@@ -394,7 +375,7 @@ def load_players(
 ) -> list[Weights]:
     """The players of a run, from its file."""
     path = policy_path(folder, cell.label, seed, num_updates, choice)
-    return load_policy(path, cell.network, made_for(cell, seed, num_updates, choice))[0]
+    return load_policy(path, NETWORK, made_for(cell, seed, num_updates, choice))[0]
 
 
 def shorter(settings: PPOSettings) -> PPOSettings:
