@@ -5,6 +5,7 @@ Numbers are dictionaries for :func:`experiments.chapter.numbers`.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +14,7 @@ from typing import Any
 import joblib
 import numpy as np
 import pandas as pd
+import scipy.stats
 
 from experiments.doors.arms import (
     CONTROLS,
@@ -181,7 +183,7 @@ def controlled(
     """How many points more IPO, as published, opens than what was trained as long.
 
     Paired over the runs that both have. ``power``: with which so many pairs, spread as they are,
-    would find ``effect`` points.
+    would find ``effect`` points; ``needed``: how many pairs find them with 80 %.
     """
     ipo = mean_rate(success, arms["ipo_half"], tested)
     rows = []
@@ -200,14 +202,24 @@ def controlled(
                 "95 %": f"[{found.low:+.1f}, {found.high:+.1f}]",
                 "p": found.p,
                 "power": power(effect, spread, len(runs)) if spread else 1.0,
+                "needed": pairs_needed(effect, spread),
             }
         )
     return pd.DataFrame(rows)
 
 
+def pairs_needed(effect: float, spread: float) -> int:
+    """Pairs that find an effect with a power of 80 % at 5 %, where differences have this spread.
+
+    n = (s (z_0.975 + z_0.8) / effect)^2,    at least 2
+    """
+    z = scipy.stats.norm.ppf([0.975, 0.8]).sum()
+    return max(2, math.ceil((spread * z / effect) ** 2))
+
+
 def control_numbers(controlled: pd.DataFrame) -> dict[str, Any]:
-    """Difference, interval and power of every control."""
-    columns = {"": "difference", "_interval": "95 %", "_power": "power"}
+    """Difference, interval, power and pairs needed of every control."""
+    columns = {"": "difference", "_interval": "95 %", "_power": "power", "_needed": "needed"}
     rows = controlled.set_index("key")
     return {
         f"control_{arm}{suffix}": rows.loc[arm, column]
