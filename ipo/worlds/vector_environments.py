@@ -33,6 +33,8 @@ class FromGymnasium:
             # Gymnasium's own seeds s, s + 1, ... would give neighbouring runs the same streams.
             streams = np.random.SeedSequence(seed).spawn(envs.num_envs)
             seed = [int(stream.generate_state(1)[0]) for stream in streams]
+        if len(seed) != envs.num_envs:
+            raise ValueError(f"seed: {len(seed)} seeds, must be one for each of {envs.num_envs}")
         self.seeds = seed
 
     def reset(self) -> Tensor:

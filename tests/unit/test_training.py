@@ -289,6 +289,14 @@ def test_gymnasiums_environments_get_streams_of_their_own():
     assert len({tuple(row.tolist()) for row in torch.cat([first, other]).flatten(0, 1)}) == 8
 
 
+def test_gymnasiums_environments_may_have_a_seed_each():
+    every = FromGymnasium(vector(), 2, seed=[5, 6, 7, 8]).reset().flatten(0, 1)
+    turned = FromGymnasium(vector(), 2, seed=[8, 7, 6, 5]).reset().flatten(0, 1)
+    assert torch.equal(every, turned.flip(0))
+    with pytest.raises(ValueError, match="seed: 3 seeds, must be one for each of 4"):
+        FromGymnasium(vector(), 2, seed=[5, 6, 7])
+
+
 def test_continuous_actions_reach_gymnasiums_environments():
     copies = FromGymnasium(vector(), 2, seed=0)
     copies.reset()
