@@ -560,7 +560,10 @@ def test_hooks_are_robust_or_not(empty, sign, expected):
     write_door(empty, "success", success={(*arm, 1.5): (0.6, sign * 0.2) for arm in arms})
     found = finding(empty, "door-hooks-are-robust")
     assert found.verdict == expected
-    assert found.variants["share of the hook's inside and success of policies, not matched"].verdict == expected
+    assert (
+        found.variants["share of the hook's inside and success of policies, not matched"].verdict
+        == expected
+    )
 
 
 @pytest.mark.parametrize(
