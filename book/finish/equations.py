@@ -14,6 +14,7 @@ from messages import BuildError
 
 SCRIPT = Path(__file__).with_name("equations.js")
 TEX = re.compile(r"\\\((.*?)\\\)|\\\[(.*?)\\\]", re.DOTALL)
+PUNCTUATION = re.compile(r"[.,;:!?)\]]+")
 
 
 def set_equations(pages: dict[str, BeautifulSoup]) -> None:
@@ -30,7 +31,9 @@ def set_equations(pages: dict[str, BeautifulSoup]) -> None:
     })  # fmt: skip
     for name, answer in answers.items():
         for (text, _, _), html in zip(found[name], answer["equations"], strict=True):
+            element = text.parent
             text.replace_with(parsed(html))
+            keep_punctuation(element)
         body = pages[name].body
         assert body is not None
         body.append(parsed(f'<svg style="display: none">{answer["glyphs"]}</svg>'))
@@ -38,6 +41,14 @@ def set_equations(pages: dict[str, BeautifulSoup]) -> None:
         for script in page.find_all("script"):
             if "MathJax" in script.get_text() or "mathjax" in str(script.get("src", "")).lower():
                 script.decompose()
+
+
+def keep_punctuation(math: Tag) -> None:
+    """No line begins with the punctuation that follows an equation."""
+    following = math.next_sibling
+    if isinstance(following, NavigableString) and (marks := PUNCTUATION.match(following)):
+        math.wrap(parsed('<span class="together"></span>')).append(marks[0])
+        following.replace_with(following[marks.end() :])
 
 
 def tex_in(element: Tag) -> list[tuple[NavigableString, str, bool]]:

@@ -26,6 +26,14 @@ def page(body: str) -> BeautifulSoup:
     return BeautifulSoup(f"<html><body>{body}</body></html>", "html.parser")
 
 
+def test_punctuation_stays_with_the_equation_before_it():
+    one = page(r'<p>(<span class="math">\(x\)</span>), <span class="math">\(y\)</span> and</p>')
+    set_equations({"one": one})
+    [together] = one.select(".together")
+    assert together.get_text().endswith("),") and together.next_sibling == " "
+    assert one.p.get_text().startswith("(") and one.p.get_text().endswith(" and")
+
+
 def test_equations_become_pictures_that_screen_readers_can_read():
     one = page(
         r'<script src="x/mathjax.js"></script><script>window.MathJax = {}</script>'
