@@ -286,8 +286,8 @@ def make_doors(
 ) -> FromGymnasium:
     """Random doors of the training frictions, for the one run that there is.
 
-    A player who owns all domains draws them together, so of the doors of a run and its seed only
-    those of the first domain are IPO's.
+    A player who owns all domains draws them together, so that no more than doors of the first
+    domain are those of IPO with the same seed.
     """
     (generator,) = generators
     return FromGymnasium(_doors(domains, num_copies), 1, int(generator.integers(2**63)))
