@@ -72,6 +72,7 @@ class Cell:
             would be the same: its random streams do not depend on how long it will last.
         curve_every: updates between two looks at a friction that is not trained on.
         same_doors: the doors are IPO's, whoever learns from them; see :class:`SameDoors`.
+        hidden: units of each hidden layer.
     """
 
     label: str
@@ -79,6 +80,7 @@ class Cell:
     saved_after: tuple[Count, ...] = (95, 190)
     curve_every: Count = 10
     same_doors: bool = False
+    hidden: tuple[Count, ...] = (64, 64)
 
     def __post_init__(self) -> None:
         check_file_name("label", self.label)  # of policies and check-points
@@ -90,6 +92,10 @@ class Cell:
                 )
 
     @property
+    def network(self) -> DenseInNumpy:
+        return DenseInNumpy(15, 6, Gaussian, self.hidden)
+
+    @property
     def columns(self) -> dict[str, Any]:
         return {"method": self.label, "train_frictions": "+".join(map(str, TRAIN_FRICTIONS))}
 
@@ -99,7 +105,8 @@ def controls(num_updates: int = 95, curve_every: int = 10, **changes: Any) -> di
 
     They end where the published training of IPO did: the ensemble, whose players learn from all
     doors; one network that learns from one domain at a time; IPO with PPO's learning rate. The
-    latter two have IPO's doors by themselves; PPO and the ensemble are there with them, too.
+    latter two have IPO's doors by themselves. With the same doors: PPO, PPO with one network of as
+    many weights as IPO's two, and the ensemble.
     """
 
     def control(label: str, method: str, learning_rate: float, **options: Any) -> Cell:
@@ -113,6 +120,7 @@ def controls(num_updates: int = 95, curve_every: int = 10, **changes: Any) -> di
         control("in_turn", "in_turn", 5e-4),
         control("ipo_lr1e-3", "ipo", 1e-3),
         control("ppo_same_doors", "ppo", 1e-3, same_doors=True),
+        control("ppo_wide_same_doors", "ppo", 1e-3, same_doors=True, hidden=(94, 94)),
         control("ensemble_same_doors", "ensemble", 5e-4, same_doors=True),
     ]
     return {cell.label: cell for cell in cells}
@@ -191,7 +199,13 @@ class Run:
         self.num_updates += 1
         self._note_episodes()
         if self.num_updates % self.cell.curve_every == 0:
-            found = last_info(self.training.players, CURVE_FRICTION, NUM_CURVE_DOORS, CURVE_SEED)
+            found = last_info(
+                self.training.players,
+                CURVE_FRICTION,
+                NUM_CURVE_DOORS,
+                CURVE_SEED,
+                self.cell.network,
+            )
             self._note(CURVE_FRICTION, "success_most_likely", found["opened"].mean())
         self.cpu_seconds += time.process_time() - before
         self._note("training", "cpu_seconds", self.cpu_seconds)
@@ -278,7 +292,7 @@ class Run:
 def new_training(cell: Cell, seed: int) -> Training:
     """One run of training on doors, from its start."""
     doors = SameDoors() if cell.same_doors else make_doors
-    return Training(NETWORK, doors, len(TRAIN_FRICTIONS), cell.settings, [seed])
+    return Training(cell.network, doors, len(TRAIN_FRICTIONS), cell.settings, [seed])
 
 
 def make_doors(
@@ -324,7 +338,12 @@ def seeds_of(stream: np.random.SeedSequence, number: int) -> list[int]:
 
 
 def last_info(
-    players: Sequence[Weights], friction: float, num_doors: int, seed: int, **options: Any
+    players: Sequence[Weights],
+    friction: float,
+    num_doors: int,
+    seed: int,
+    network: DenseInNumpy = NETWORK,
+    **options: Any,
 ) -> dict[str, np.ndarray]:
     """What the players' average makes of fresh doors in one episode, by its most likely actions.
 
@@ -336,7 +355,7 @@ def last_info(
     """
     doors = VectorDoor([friction] * num_doors, **options)
     try:
-        policy = NETWORK.frozen(players)
+        policy = network.frozen(players)
         observations, _ = doors.reset(seed=seed)
         while True:
             rows = torch.tensor(observations, dtype=torch.float32).unsqueeze(0)
@@ -375,7 +394,7 @@ def load_players(
 ) -> list[Weights]:
     """The players of a run, from its file."""
     path = policy_path(folder, cell.label, seed, num_updates, choice)
-    return load_policy(path, NETWORK, made_for(cell, seed, num_updates, choice))[0]
+    return load_policy(path, cell.network, made_for(cell, seed, num_updates, choice))[0]
 
 
 def shorter(settings: PPOSettings) -> PPOSettings:
