@@ -34,7 +34,8 @@ class NetworkPlayers:
     Attributes:
         players: weights of every player; they change in place.
         parts: by name, the weights that move at a time.
-        rows: the same memory as one ``[R, P]`` for each part, which the optimisers move.
+        rows: the same memory as one ``[R, P]`` for each part, which the optimisers move; some zeros
+            at the end.
 
     Raises:
         ValueError: a variable Phi of a network that has none.
@@ -107,8 +108,7 @@ class NetworkPlayers:
 
     def step(self, part: int, slopes: Sequence[Tensor], max_gradient_norm: float) -> None:
         """Move a part down the slopes in its weights, of a bounded norm in each run."""
-        in_row = torch.cat([slope.flatten(1) for slope in slopes], 1)
-        self.rows[part].grad = clip_gradient(in_row, max_gradient_norm)
+        self.rows[part].grad = clip_gradient(side_by_side(slopes), max_gradient_norm)
         self.optimizers[part].step()
 
     @torch.no_grad()
@@ -150,7 +150,19 @@ def in_one_row(weights: Weights) -> tuple[Tensor, Weights]:
 
     They share their memory, so an optimiser has one tensor to move instead of many.
     """
-    row = torch.cat([w.flatten(1) for w in weights.values()], 1)
-    parts = row.split([w[0].numel() for w in weights.values()], 1)
+    row = side_by_side(list(weights.values()))
+    sizes = [w[0].numel() for w in weights.values()]
+    parts = row[:, : sum(sizes)].split(sizes, 1)
     named = zip(weights.items(), parts, strict=True)
     return row, {name: part.unflatten(1, w.shape[1:]) for (name, w), part in named}
+
+
+def side_by_side(parts: Sequence[Tensor]) -> Tensor:
+    """``[R, ...]`` each, in one row ``[R, P]``, with zeros up to a multiple of 16.
+
+    Processors take up to so many numbers at a time, and round those alone that are left over:
+    with rows of that length, no run's rounding depends on how many there are.
+    """
+    flat = [part.flatten(1) for part in parts]
+    left = -sum(part.shape[1] for part in flat) % 16
+    return torch.cat([*flat, flat[0].new_zeros(len(flat[0]), left)], 1)

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ipo.checks import Count, checked
+from ipo.checks import Count, check_count, checked
 from ipo.distributions import Distribution, Gaussian, Generators
 from ipo.game import average
 
@@ -173,6 +173,14 @@ def averaged(network: Callable[[Weights, Tensor], Outputs], players: Sequence[We
 def copied(players: Sequence[Weights]) -> list[Weights]:
     """The players as they are now, without gradients; training changes weights in place."""
     return [{name: w.detach().clone() for name, w in player.items()} for player in players]
+
+
+@checked
+def of_run(players: Annotated[Sequence[Weights], "E"], run: int) -> list[Weights]:
+    """The players of one of R runs, as views ``[1, ...]`` of the same memory."""
+    num_runs = min(len(weights) for player in players for weights in player.values())
+    check_count("run", run, 0, num_runs - 1)
+    return [{name: w[run : run + 1] for name, w in player.items()} for player in players]
 
 
 def dense(weights: Weights, name: str, x: Tensor) -> Tensor:

@@ -11,9 +11,8 @@ import numpy as np
 import torch
 from gymnasium.spaces import Box, Discrete, Space, flatdim
 
-from ipo.checks import check_count
 from ipo.distributions import Categorical, Distribution, Gaussian
-from ipo.networks import Network, Weights
+from ipo.networks import Network, Weights, of_run
 from ipo.own_domains.copies import clipped, dtype_of, is_image
 from ipo.own_domains.networks import ImageNetwork, VectorNetwork
 
@@ -54,11 +53,8 @@ class Policy:
             raise ValueError(
                 f"observation: has shape {seen.shape}, must have {self.observations.shape}"
             )
-        check_count("run", run, minimum=0)
-        if run >= len(self.seeds):
-            raise ValueError(f"run = {run}: must be less than {len(self.seeds)}, the runs")
-        of_run = [{name: w[run : run + 1] for name, w in p.items()} for p in self.players]
-        parameters, _ = self.network.frozen(of_run)(torch.from_numpy(seen)[None, None])
+        own = of_run(self.players, run)
+        parameters, _ = self.network.frozen(own)(torch.from_numpy(seen)[None, None])
         return clipped(self.network.distribution.mode(parameters)[0, 0].numpy(), self.actions)
 
     def save(self, path: str | os.PathLike) -> None:

@@ -42,7 +42,7 @@ from ipo.causality import icp, predictors, regressions, scm, small_games
 from ipo.dense_in_numpy import DenseInNumpy
 from ipo.distributions import Categorical
 from ipo.network_players import NetworkPlayers
-from ipo.networks import DenseNetwork, copied
+from ipo.networks import DenseNetwork, copied, of_run
 from ipo.own_domains import copies, networks
 from ipo.own_domains import policy as policies
 from ipo.worlds import (
@@ -288,6 +288,8 @@ def rows_of_learning() -> Iterator[Row]:
     yield row(on_table.average, {"players": [grid.start(generators)]}, players=refused)
     yield row(of_table.average, {"players": [dense.start(generators)]}, players=refused)
     yield row(copied, {"players": [grid.start(generators)]}, players=bad("kind of object", 3, [3]))
+    one = {"players": [grid.start(generators)], "run": 0}
+    yield row(of_run, one, players=LIST, run=NATURAL + bad("range", len(generators)))
 
     yield row(
         rollouts.RewardNormalizer, {"num_runs": 2, "num_copies": 3, "discount": 0.9, "clip": 10.0}

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ from experiments.checkpoints import (
     save_checkpoint,
 )
 from experiments.doors import training as door_training
-from experiments.doors.training import NETWORK, Cell, Run, published_door, train_run
+from experiments.doors.training import NETWORK, Cell, Runs, published_door, train_run
 from experiments.experiment import Places
 from experiments.policies import load_policy
 from experiments.store import Store
@@ -119,21 +120,24 @@ def without_time(rows):
     return rows[rows["metric"] != "cpu_seconds"].reset_index(drop=True)
 
 
+def assert_same_policies(folder, other):
+    assert {path.name for path in folder.iterdir()} == {path.name for path in other.iterdir()}
+    for path in folder.iterdir():
+        players, same = (load_policy(p, NETWORK)[0] for p in (path, other / path.name))
+        for own, wanted in zip(players, same, strict=True):
+            assert all(torch.equal(weights, wanted[name]) for name, weights in own.items())
+
+
 def test_an_interrupted_run_ends_as_if_nothing_had_happened(tmp_path):
     cell = small("ipo")
     whole = train_run(cell, [5], tmp_path / "a", tmp_path / "whole", progress=False)
     for _ in range(2):
-        Run(cell, 5, tmp_path / "b", tmp_path / "parts").update()  # each goes on where one ended
+        Runs(cell, [5], tmp_path / "b", tmp_path / "parts").update()  # each goes on where one ended
     parts = train_run(cell, [5], tmp_path / "b", tmp_path / "parts", progress=False)
     assert without_time(parts).equals(without_time(whole))
     names = {f"ipo_5_{n}_{choice}.safetensors" for n in (2, 3) for choice in ("best", "last")}
     assert {file.name for file in (tmp_path / "whole").iterdir()} == names
-    for name in names:
-        (one, _), (other, _) = (
-            load_policy(tmp_path / folder / name, NETWORK) for folder in ("whole", "parts")
-        )
-        for d, player in enumerate(one):
-            assert all(torch.equal(w, other[d][n]) for n, w in player.items())
+    assert_same_policies(tmp_path / "whole", tmp_path / "parts")
 
 
 def test_a_training_is_kept_until_its_rows_are_saved(tmp_path, monkeypatch):
@@ -145,8 +149,8 @@ def test_a_training_is_kept_until_its_rows_are_saved(tmp_path, monkeypatch):
         patched.setattr(experiments.store, "replace_text", full)
         with pytest.raises(OSError, match="No space left"):
             store.fill(experiment, cells, [0], num_workers=1)
-    expected = Run(cells[0], 0, places.checkpoints, places.policies).rows()
-    monkeypatch.setattr(Run, "update", full)
+    expected = Runs(cells[0], [0], places.checkpoints, places.policies).rows()
+    monkeypatch.setattr(Runs, "update", full)
     rows = store.fill(experiment, cells, [0], num_workers=1)
     assert len(rows) == len(expected)
     assert sorted(rows["value"]) == pytest.approx(sorted(expected["value"]), rel=1e-8)
@@ -161,18 +165,37 @@ def test_a_shorter_training_is_the_beginning_of_a_longer_one(tmp_path):
     assert without_time(short).equals(without_time(long)[: len(without_time(short))])
 
 
-def test_a_checkpoint_of_other_settings_is_refused(tmp_path):
-    Run(small("ppo"), 0, tmp_path, tmp_path).update()
-    other = Cell("ppo", published_door("ppo", learning_rate=0.1, num_updates=3), saved_after=(3,))
-    with pytest.raises(CheckpointError, match="made with other settings; delete it"):
-        Run(other, 0, tmp_path, tmp_path)
+def test_a_checkpoint_of_other_settings_or_runs_is_refused(tmp_path):
+    cell = small("ppo")
+    Runs(cell, [0], tmp_path, tmp_path).update()
+    other = replace(cell, settings=replace(cell.settings, learning_rate=0.1))
+    refused = r"was made for others: .*learning_rate = 0\.001, asked for 0\.1; delete it"
+    with pytest.raises(CheckpointError, match=refused):
+        Runs(other, [0], tmp_path, tmp_path)
+    with pytest.raises(CheckpointError, match=r"seeds = \[0\], asked for \[0, 1\]; delete it"):
+        Runs(cell, [0, 1], tmp_path, tmp_path)
+
+
+@pytest.mark.parametrize("method", ["ppo", "ipo"])
+def test_a_run_does_not_depend_on_those_beside_it(tmp_path, method):
+    """To the digit: its learning curve, and both of its policies."""
+    cell = small(method, 2)
+    together = train_run(cell, [3, 4], tmp_path / "c", tmp_path / "together", progress=False)
+    alone = [
+        train_run(cell, [seed], tmp_path / "d", tmp_path / "alone", progress=False)
+        for seed in (3, 4)
+    ]
+    for own in alone:
+        of_run = together[together["run"] == own["run"].iloc[0]]
+        assert without_time(of_run).equals(without_time(own))
+    assert_same_policies(tmp_path / "together", tmp_path / "alone")
 
 
 def test_the_best_policy_is_that_of_the_best_last_ten_episodes(tmp_path, monkeypatch):
-    run = Run(small("ppo", 3), 0, tmp_path / "c", tmp_path / "p")
+    run = Runs(small("ppo", 3), [0], tmp_path / "c", tmp_path / "p")
     run.update()
     first = [w.clone() for w in run.best[0].values()]
-    run.best_return = np.inf  # nothing can be better any more
+    run.best_returns[:] = np.inf  # nothing can be better any more
     run.update()
     assert all(torch.equal(a, b) for a, b in zip(first, run.best[0].values(), strict=True))
     best, _ = load_policy(door_training.policy_path(tmp_path / "p", "ppo", 0, 2), NETWORK)

@@ -128,7 +128,7 @@ def test_arms_with_the_same_doors_have_those_of_ipo(label):
     def doors(label):
         cell = CELLS[label]
         settings = replace(cell.settings, num_envs=(4, 2), num_steps=8, num_minibatches=1)
-        training = new_training(replace(cell, settings=settings), seed=3)
+        training = new_training(replace(cell, settings=settings), seeds=[3])
         drawn = []
         for collector in training.collectors:
             collector.environments.reset()

@@ -86,7 +86,7 @@ def load_players(policies: str | Path, cell: Cell, seed: int) -> list[Weights]:
 
 def gone_on(cell: Cell, seed: int, players: Sequence[Weights], d: int) -> list[Weights]:
     """The players after player d has learnt for some updates, in its own doors, alone."""
-    training = door_training.new_training(cell.trained, seed)
+    training = door_training.new_training(cell.trained, [seed])
     training.learners.set(players)
     for _ in tqdm(range(cell.num_alone), desc=f"player {d}", unit="update", leave=False):
         training.update(only=d)

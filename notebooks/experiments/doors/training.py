@@ -5,8 +5,9 @@ Test frictions are looked at while training, for the curves, but nothing depends
 
 from __future__ import annotations
 
+import itertools
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -18,13 +19,13 @@ import torch
 from tqdm import tqdm
 
 from experiments.checkpoints import CheckpointError, files_of, load_checkpoint, save_checkpoint
-from experiments.experiment import Experiment, plain
+from experiments.experiment import Experiment, difference, plain
 from experiments.files import check_file_name
 from experiments.policies import check_place, load_policy, save_policy
 from ipo.checks import Count, checked
 from ipo.dense_in_numpy import DenseInNumpy
-from ipo.distributions import Gaussian
-from ipo.networks import Weights, copied
+from ipo.distributions import Gaussian, Generators
+from ipo.networks import Weights, copied, of_run
 from ipo.ppo import PPOSettings, Training
 from ipo.worlds.many_doors import VectorDoor
 from ipo.worlds.vector_environments import FromGymnasium
@@ -140,7 +141,7 @@ def train_run(
     policies: str | Path,
     progress: bool = True,
 ) -> pd.DataFrame:
-    """Train one run, or go on where it was interrupted; save its policies; its learning curve.
+    """Train runs together, or go on where they were interrupted; save their policies; their curves.
 
     The state is saved after every update in ``checkpoints``, and stays there in the end: it is all
     that there is until the rows are saved, and then the store removes it.
@@ -149,45 +150,49 @@ def train_run(
         rows with the cell's columns, ``frames``, ``run``, ``domain``, ``metric`` and ``value``.
         Metrics of training episodes, whose actions are random: ``return``, ``success``;
         ``deviation``, the mean of the policy's standard deviations; of the most likely actions on
-        the same fresh doors: ``success_most_likely``; ``cpu_seconds``.
+        the same fresh doors: ``success_most_likely``; ``cpu_seconds``, an equal share for each.
 
     Raises:
-        CheckpointError: a check-point of other settings, or one that cannot be written.
+        CheckpointError: a check-point of other settings or runs, or one that cannot be written.
         ValueError: policies of other settings are where these would be saved.
     """
-    (seed,) = seeds
-    run = Run(cell, seed, Path(checkpoints), Path(policies))
+    runs = Runs(cell, seeds, Path(checkpoints), Path(policies))
     bar = tqdm(
         total=cell.settings.num_updates,
-        initial=run.num_updates,
-        desc=f"{cell.label} {seed}",
+        initial=runs.num_updates,
+        desc=f"{cell.label} {', '.join(map(str, seeds))}",
         unit="update",
         disable=not progress,
         leave=False,
     )
     with bar:
-        while run.num_updates < cell.settings.num_updates:
-            run.update()
+        while runs.num_updates < cell.settings.num_updates:
+            runs.update()
             bar.update()
-    return run.rows()
+    return runs.rows()
 
 
-class Run:
-    """One run of a cell, with its check-point."""
+class Runs:
+    """R runs of a cell that are trained together, with their check-point.
 
-    def __init__(self, cell: Cell, seed: int, checkpoints: Path, policies: Path) -> None:
-        self.cell, self.seed, self.policies = cell, seed, policies
-        self.checkpoint = checkpoint_path(cell, seed, checkpoints)
-        self.training = new_training(cell, seed)
+    It takes less time than one after the other, and a run is the same to the digit, whoever is
+    trained beside it.
+    """
+
+    def __init__(self, cell: Cell, seeds: Sequence[int], checkpoints: Path, policies: Path) -> None:
+        self.cell, self.seeds, self.policies = cell, list(seeds), policies
+        self.checkpoint = checkpoint_path(cell, self.seeds[0], checkpoints)
+        self.training = new_training(cell, seeds)
         self.num_updates = 0
-        self.cpu_seconds = 0.0
-        self.best_return = -np.inf
-        self.best: list[Weights] = []
-        self.curve: list[list[Any]] = []  # frames, domain, metric, value
-        self.identity = plain({"settings": cell, "seed": seed})
-        for updates in cell.saved_after:
-            for choice in CHOICES:
-                check_place(*self._policy(updates, choice))
+        self.cpu_seconds = 0.0  # of each run
+        self.best_returns = torch.full((len(self.seeds),), -torch.inf, dtype=torch.float64)
+        self.best = copied(self.training.players)
+        self.curve: list[list[Any]] = []  # frames, run, domain, metric, value
+        self.identity = plain({"settings": cell, "seeds": self.seeds})
+        for seed in self.seeds:
+            for updates in cell.saved_after:
+                for choice in CHOICES:
+                    check_place(*self._policy(seed, updates, choice))
         state = load_checkpoint(self.checkpoint)
         if state is not None:
             self._restore(state)
@@ -199,16 +204,9 @@ class Run:
         self.num_updates += 1
         self._note_episodes()
         if self.num_updates % self.cell.curve_every == 0:
-            found = last_info(
-                self.training.players,
-                CURVE_FRICTION,
-                NUM_CURVE_DOORS,
-                CURVE_SEED,
-                self.cell.network,
-            )
-            self._note(CURVE_FRICTION, "success_most_likely", found["opened"].mean())
-        self.cpu_seconds += time.process_time() - before
-        self._note("training", "cpu_seconds", self.cpu_seconds)
+            self._note(CURVE_FRICTION, "success_most_likely", self._successes())
+        self.cpu_seconds += (time.process_time() - before) / len(self.seeds)
+        self._note("training", "cpu_seconds", [self.cpu_seconds] * len(self.seeds))
         if self.num_updates in self.cell.saved_after:
             self._save_policies()
         save_checkpoint(self.checkpoint, self._state())
@@ -218,45 +216,56 @@ class Run:
             {
                 **self.cell.columns,
                 "frames": frames,
-                "run": self.seed,
+                "run": seed,
                 "domain": str(domain),
                 "metric": metric,
-                "value": float(value),
+                "value": value,
             }
-            for frames, domain, metric, value in self.curve
+            for frames, seed, domain, metric, value in self.curve
         )
 
-    def _note(self, domain: float | str, metric: str, value: float) -> None:
-        self.curve.append([self.training.num_frames, domain, metric, float(value)])
+    def _note(self, domain: float | str, metric: str, values: Iterable[float]) -> None:
+        for seed, value in zip(self.seeds, values, strict=True):
+            self.curve.append([self.training.num_frames, seed, domain, metric, float(value)])
 
     def _note_episodes(self) -> None:
-        """Returns and successes of the episodes of this update, and the best policy so far.
+        """Returns and successes of the episodes of this update, and the best policies so far.
 
         The last ten episodes, by which the published runs choose, are the last to end; of those
         that end together, the doors with more friction come last.
         """
-        frictions, returns, successes = [], [], []
+        episodes = []
         for collector in self.training.collectors:
             doors = collector.environments.envs
-            for episode_returns, episode_opened in doors.episodes:
-                frictions.extend(doors.frictions)
-                returns.extend(episode_returns)
-                successes.extend(episode_opened)
+            episodes += [(doors.frictions, *episode) for episode in doors.episodes]
             doors.episodes.clear()
+        frictions, returns, successes = (
+            np.concatenate([np.reshape(part, (len(self.seeds), -1)) for part in parts], 1)
+            for parts in zip(*episodes, strict=True)
+        )
         for friction in TRAIN_FRICTIONS:
-            chosen = np.array(frictions) == friction
-            self._note(friction, "return", np.array(returns)[chosen].mean())
-            self._note(friction, "success", np.array(successes)[chosen].mean())
-        deviations = [player["log_std"].detach().exp() for player in self.training.players]
-        self._note("training", "deviation", torch.stack(deviations).mean())
-        last = float(np.mean(returns[-NUM_LAST:]))
-        if last > self.best_return:
-            self.best_return, self.best = last, copied(self.training.players)
+            chosen = frictions[0] == friction
+            self._note(friction, "return", returns[:, chosen].mean(1))
+            self._note(friction, "success", successes[:, chosen].mean(1))
+        deviations = torch.stack([player["log_std"].exp() for player in self.training.players])
+        self._note("training", "deviation", deviations.mean(2).mean(0))
+        last = torch.from_numpy(returns[:, -NUM_LAST:].mean(1))
+        better = last > self.best_returns
+        self.best_returns[better] = last[better]
+        for best, now in zip(self.best, self.training.players, strict=True):
+            for name, weights in best.items():
+                weights[better] = now[name][better]
 
-    def _policy(self, updates: int, choice: str) -> tuple[Path, dict[str, Any]]:
+    def _successes(self) -> list[float]:
+        """What share of the same fresh doors each run opens by its most likely actions."""
+        door = CURVE_FRICTION, NUM_CURVE_DOORS, CURVE_SEED, self.cell.network
+        players = [of_run(self.training.players, r) for r in range(len(self.seeds))]
+        return [last_info(own, *door)["opened"].mean() for own in players]
+
+    def _policy(self, seed: int, updates: int, choice: str) -> tuple[Path, dict[str, Any]]:
         """Where a policy is, and what it is made for."""
-        path = policy_path(self.policies, self.cell.label, self.seed, updates, choice)
-        return path, made_for(self.cell, self.seed, updates, choice)
+        path = policy_path(self.policies, self.cell.label, seed, updates, choice)
+        return path, made_for(self.cell, seed, updates, choice)
 
     def _save_policies(self) -> None:
         notes = {
@@ -264,9 +273,10 @@ class Run:
             "cpu_seconds": round(self.cpu_seconds, 1),
             "versions": {name: version(name) for name in ("torch", "numpy", "mujoco")},
         }
-        for choice, players in (("best", self.best), ("last", self.training.players)):
-            path, about = self._policy(self.num_updates, choice)
-            save_policy(path, players, about, notes)
+        for r, seed in enumerate(self.seeds):
+            for choice, players in (("best", self.best), ("last", self.training.players)):
+                path, about = self._policy(seed, self.num_updates, choice)
+                save_policy(path, of_run(players, r), about, notes)
 
     def _state(self) -> dict[str, Any]:
         return {
@@ -274,37 +284,35 @@ class Run:
             "training": self.training.state(),
             "num_updates": self.num_updates,
             "cpu_seconds": self.cpu_seconds,
-            "best_return": self.best_return,
+            "best_returns": self.best_returns,
             "best": self.best,
             "curve": self.curve,
         }
 
     def _restore(self, state: dict[str, Any]) -> None:
-        if state["identity"] != self.identity:
+        if differs := difference(state["identity"], self.identity):
             raise CheckpointError(
-                f"{self.checkpoint}: was made with other settings; delete it to begin anew"
+                f"{self.checkpoint}: was made for others: {differs}; delete it to begin anew"
             )
         self.training.restore(state["training"])
-        for name in ("num_updates", "cpu_seconds", "best_return", "best", "curve"):
+        for name in ("num_updates", "cpu_seconds", "best_returns", "best", "curve"):
             setattr(self, name, state[name])
 
 
-def new_training(cell: Cell, seed: int) -> Training:
-    """One run of training on doors, from its start."""
+def new_training(cell: Cell, seeds: Sequence[int]) -> Training:
+    """Runs of training on doors, from their start."""
     doors = SameDoors() if cell.same_doors else make_doors
-    return Training(cell.network, doors, len(TRAIN_FRICTIONS), cell.settings, [seed])
+    return Training(cell.network, doors, len(TRAIN_FRICTIONS), cell.settings, seeds)
 
 
-def make_doors(
-    domains: list[int], num_copies: list[int], generators: Sequence[np.random.Generator]
-) -> FromGymnasium:
-    """Random doors of the training frictions, for the one run that there is.
+def make_doors(domains: list[int], num_copies: list[int], generators: Generators) -> FromGymnasium:
+    """Random doors of the training frictions for every run.
 
     A player who owns all domains draws them together, so that no more than doors of the first
     domain are those of IPO with the same seed.
     """
-    (generator,) = generators
-    return FromGymnasium(_doors(domains, num_copies), 1, int(generator.integers(2**63)))
+    streams = [new_stream(generator) for generator in generators]
+    return _doors(domains, num_copies, [seeds_of(own, sum(num_copies)) for own in streams])
 
 
 class SameDoors:
@@ -314,22 +322,30 @@ class SameDoors:
     """
 
     def __init__(self) -> None:
-        self.streams: list[np.random.SeedSequence] = []
+        self.streams: list[list[np.random.SeedSequence]] = []  # of every run, one for each domain
 
     def __call__(
-        self, domains: list[int], num_copies: list[int], generators: Sequence[np.random.Generator]
+        self, domains: list[int], num_copies: list[int], generators: Generators
     ) -> FromGymnasium:
-        (generator,) = generators
         if not self.streams:
-            seeds = [int(generator.integers(2**63)) for _ in TRAIN_FRICTIONS]
-            self.streams = [np.random.SeedSequence(seed) for seed in seeds]
-        taken = zip(domains, num_copies, strict=True)
-        seeds = [own for domain, number in taken for own in seeds_of(self.streams[domain], number)]
-        return FromGymnasium(_doors(domains, num_copies), 1, seeds)
+            self.streams = [[new_stream(own) for _ in TRAIN_FRICTIONS] for own in generators]
+        taken = list(zip(domains, num_copies, strict=True))
+        seeds = [
+            [seed for domain, number in taken for seed in seeds_of(streams[domain], number)]
+            for streams in self.streams
+        ]
+        return _doors(domains, num_copies, seeds)
 
 
-def _doors(domains: list[int], num_copies: list[int]) -> VectorDoor:
-    return VectorDoor(np.repeat([TRAIN_FRICTIONS[d] for d in domains], num_copies).tolist())
+def _doors(domains: list[int], num_copies: list[int], seeds: list[list[int]]) -> FromGymnasium:
+    """Doors of these domains for every run, drawn from the run's seeds."""
+    frictions = np.repeat([TRAIN_FRICTIONS[d] for d in domains], num_copies).tolist()
+    together = list(itertools.chain(*seeds))
+    return FromGymnasium(VectorDoor(frictions * len(seeds)), len(seeds), together)
+
+
+def new_stream(generator: np.random.Generator) -> np.random.SeedSequence:
+    return np.random.SeedSequence(int(generator.integers(2**63)))
 
 
 def seeds_of(stream: np.random.SeedSequence, number: int) -> list[int]:
@@ -368,7 +384,7 @@ def last_info(
 
 
 def checkpoint_path(cell: Cell, seed: int, checkpoints: str | Path) -> Path:
-    """The check-point of a run."""
+    """The check-point of runs that are trained together; the first one names it."""
     return Path(checkpoints) / f"{cell.label}_{seed}.checkpoint"
 
 
@@ -408,4 +424,4 @@ def short(cell: Cell) -> Cell:
     return replace(cell, settings=settings, saved_after=(1,), curve_every=1)
 
 
-EXPERIMENT = Experiment(train_run, Cell, short, (0,), runs_at_once=1, checkpoints=checkpoints_of)
+EXPERIMENT = Experiment(train_run, Cell, short, (0,), runs_at_once=5, checkpoints=checkpoints_of)
