@@ -70,20 +70,21 @@ def wall_hours(bench: dict) -> str:
     chapters = {chapter: [chapter] for chapter in CHAPTERS if any(recorded([chapter]))} | {
         "all": []
     }
-    costs = {
-        title: [[cost(part) for part in wave] for wave in recorded(names)]
-        for title, names in chapters.items()
-    }
-    dearer = {cores: factor if cores > 1 else 1 for cores in CORES}
     lines = [
         {"Cores": str(cores)}
         | {
-            title: at_least(wall_seconds(waves, cores) * dearer[cores] / 3600, 2)
-            for title, waves in costs.items()
+            title: at_least(hours(names, cores) * (factor if cores > 1 else 1), 2)
+            for title, names in chapters.items()
         }
         for cores in CORES
     ]
     return in_markdown(pd.DataFrame(lines))
+
+
+def hours(chapters: list[str], cores: int) -> float:
+    """Wall time of chapters on so many cores, each as fast as if it were alone."""
+    waves = recorded(chapters, cores)
+    return wall_seconds([[cost(part) for part in wave] for wave in waves], cores) / 3600
 
 
 def limits(bench: dict) -> str:

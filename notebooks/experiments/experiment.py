@@ -63,6 +63,8 @@ class Experiment:
         reads: ``reads(cell, seed)`` are the files that a run reads, each behind a seal as
             policies are; ``None``: it reads none.
         runs_at_once: runs of a cell that are computed, and saved, together; ``None``: all.
+        divisible: whether fewer are, where workers would have nothing to do otherwise. A run must
+            not depend on those beside it then.
         checkpoints: ``checkpoints(cell, seed)`` are the files that carry the work of a run. It is
             not the run that removes them but the store, when the rows are saved and read back.
             ``None``: nothing is kept on the way.
@@ -77,6 +79,7 @@ class Experiment:
     seeds: Annotated[tuple[int, ...], partial(check_counts, minimum=0)] = (0, 1)
     reads: Callable[..., list[Path]] | None = None
     runs_at_once: Count | None = None
+    divisible: bool = False
     checkpoints: Callable[..., list[Path]] | None = None
     earlier: Callable[[Any], Any | None] | None = None
 

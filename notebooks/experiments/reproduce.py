@@ -28,7 +28,7 @@ from tqdm import tqdm
 from experiments.confirm import CHAOTIC, LEVEL, agreement
 from experiments.experiment import Cell, Experiment, Places, rebuilt
 from experiments.registry import CHAPTERS, DATA, chosen
-from experiments.store import Store, select, timed
+from experiments.store import Batch, Store, select, timed
 from experiments.witness import Slice
 from experiments.work import finished, num_at_once
 from ipo.checks import check_choice
@@ -45,10 +45,10 @@ def reproduce(
 
     Returns a row for every experiment: its cells, and how many of them came out how.
     """
-    waves = recorded(chapters)
+    at_once = num_at_once(num_workers, scheduler)
+    waves = recorded(chapters, at_once)
     costs = [[cost(part) for part in wave if lacking(part)] for wave in waves]
     total, left = sum(cost(part) for wave in waves for part in wave), sum(map(sum, costs))
-    at_once = num_at_once(num_workers, scheduler)
     print(
         f"{sum(map(len, costs))} batches, {left / 3600:.1f} core-hours by their records: about "
         f"{wall_seconds(costs, at_once) / 3600:.1f} hours, {at_once} at a time",
@@ -62,19 +62,45 @@ def reproduce(
     return comparison(chapters)
 
 
-def recorded(chapters: Sequence[str]) -> list[list[Slice]]:
+def recorded(chapters: Sequence[str], at_once: int | None = None) -> list[list[Slice]]:
     """The shipped batches in the order in which they depend on each other: two waves.
 
-    What reads policies comes after what makes them.
+    What reads policies comes after what makes them. Where ``at_once`` batches are computed at a
+    time, batches of one cell are joined if that is cheaper and none becomes longer by it than an
+    equal share of all work.
     """
     for chapter in chapters:
         check_choice("chapter", chapter, list(CHAPTERS))
+    batches = {
+        (chapter, name): Store(DATA / "results" / chapter, name).batches()
+        for chapter, name in chosen(chapters)
+    }
+    total = sum(batch["cpu_seconds"] for own in batches.values() for batch in own)
     waves: list[list[Slice]] = [[], []]
-    for chapter, name in chosen(chapters):
-        batches = Store(DATA / "results" / chapter, name).batches()
-        reading = CHAPTERS[chapter][name].reads is not None
-        waves[reading] += [Slice(chapter, name, batch) for batch in batches]
+    for (chapter, name), own in batches.items():
+        experiment = CHAPTERS[chapter][name]
+        if at_once and experiment.divisible:
+            own = joined(own, experiment.runs_at_once, total / at_once)
+        waves[experiment.reads is not None] += [Slice(chapter, name, batch) for batch in own]
     return waves
+
+
+def joined(batches: Iterable[Batch], num_runs: int, longest: float) -> list[Batch]:
+    """Batches of one cell after each other, joined to at most so many runs and CPU-seconds.
+
+    What is known of a joined batch is what computing asks for: cell, runs and seconds.
+    """
+    found: list[Batch] = []
+    for batch in batches:
+        before = found[-1] if found else {"cell": None, "seeds": [], "cpu_seconds": 0.0}
+        seeds = [*before["seeds"], *batch["seeds"]]
+        seconds = before["cpu_seconds"] + batch["cpu_seconds"]
+        same_cell = batch["cell"] == before["cell"]
+        if same_cell and len(seeds) <= num_runs and seconds <= longest:
+            found[-1] = before | {"seeds": seeds, "cpu_seconds": seconds}
+        else:
+            found.append(batch)
+    return found
 
 
 def cost(part: Slice) -> float:

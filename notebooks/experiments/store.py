@@ -18,6 +18,7 @@ import hashlib
 import io
 import itertools
 import json
+import math
 import os
 import tempfile
 import time
@@ -37,7 +38,7 @@ from experiments.experiment import Cell, Experiment, difference, filled, plain
 from experiments.files import check_file_name, replace_text
 from experiments.rows import ResultsError, check_rows, types_of
 from experiments.sealed import DamagedError, digest_of, read_record, read_whole, write_record
-from experiments.work import finished
+from experiments.work import finished, num_at_once
 from ipo.checks import Seeds, check_count, checked
 
 TYPES = {"str": str, "bool": bool, "int64": int, "float64": float}  # a bool is an int, too
@@ -126,14 +127,20 @@ class Store:
             WorkError: a scheduler that cannot be reached or is lost.
         """
         rows, batches = self._read()
-        size = experiment.runs_at_once or len(seeds)
         lacking = [(cell, self._missing(experiment, cell, seeds, batches)) for cell in cells]
-        missing = [
-            (cell, runs[i : i + size]) for cell, runs in lacking for i in range(0, len(runs), size)
-        ]
-        if missing:
-            self._check_storable([cell for cell, _ in missing])
+        if any(runs for _, runs in lacking):
+            self._check_storable([cell for cell, runs in lacking if runs])
             self.check_writable()
+            size = experiment.runs_at_once or len(seeds)
+            if experiment.divisible:
+                at_once = num_at_once(num_workers, scheduler)
+                size = min(size, math.ceil(len(cells) * len(seeds) / at_once))
+            missing = [
+                (cell, together)
+                for cell, runs in lacking
+                for i in range(0, len(seeds), size)
+                if (together := [seed for seed in seeds[i : i + size] if seed in runs])
+            ]
             jobs = [partial(timed, experiment.run, cell, runs) for cell, runs in missing]
             work = finished(jobs, num_workers, scheduler)
             for cell, new_rows, made in tqdm(

@@ -67,7 +67,7 @@ def parallel(num_workers: int | None, **options: Any) -> joblib.Parallel:
     )
 
 
-def num_at_once(num_workers: int, scheduler: str | None = None) -> int:
+def num_at_once(num_workers: int | None, scheduler: str | None = None) -> int:
     """How many jobs are run at the same time: by so many processes, or by a scheduler's workers.
 
     Workers may come later, as those of a queue do; there will be at least one.

@@ -94,6 +94,27 @@ def test_cells_that_differ_are_an_error(toy, monkeypatch):
         reproduce.main()
 
 
+@pytest.mark.parametrize(
+    ("num_runs", "longest", "seeds", "seconds"),
+    [
+        (0, 9, [[0], [1], [2], [0]], [1, 2, 3, 4]),
+        (2, 9, [[0, 1], [2], [0]], [3, 3, 4]),
+        (5, 9, [[0, 1, 2], [0]], [6, 4]),
+        (5, 5, [[0, 1], [2], [0]], [3, 3, 4]),
+        (5, 0, [[0], [1], [2], [0]], [1, 2, 3, 4]),
+    ],
+)
+def test_runs_of_a_cell_are_joined(num_runs, longest, seeds, seconds):
+    batches = [
+        {"cell": {"label": label}, "seeds": [seed], "cpu_seconds": number}
+        for number, (label, seed) in enumerate([*zip("aaa", range(3), strict=True), ("b", 0)], 1)
+    ]
+    found = reproduce.joined(batches, num_runs, longest)
+    assert [batch["seeds"] for batch in found] == seeds
+    assert [batch["cpu_seconds"] for batch in found] == seconds
+    assert reproduce.joined([], num_runs, longest) == []
+
+
 def test_an_unknown_chapter_is_named():
     with pytest.raises(ValueError, match=r"chapter = 'dor': .*mean 'door'"):
         reproduce.reproduce(["dor"])

@@ -18,6 +18,7 @@ import pytest
 import toy_experiment
 from toy_experiment import CELLS, SEEDS, Cell, fill
 
+from experiments import store
 from experiments.experiment import Experiment
 from experiments.sealed import DamagedError, read_record, write_record, write_sealed
 from experiments.store import OriginError, ResultsError, Store
@@ -101,6 +102,32 @@ def test_runs_at_once_splits_a_cell(tmp_path, complete):
     calls = Calls()
     fill(tmp_path, CELLS[:1], run=calls, runs_at_once=2)
     assert calls.asked == [(CELLS[0], [0, 1]), (CELLS[0], [2])]
+
+
+@pytest.mark.parametrize(
+    ("num_workers", "num_cells", "batches"),
+    [
+        (1, 1, [[0, 1], [2]]),
+        (3, 1, [[0], [1], [2]]),
+        (2, 2, [[0, 1], [2]]),
+        (64, 2, [[0], [1], [2]]),
+    ],
+)
+def test_divisible_batches_leave_no_worker_without_work(
+    tmp_path, monkeypatch, num_workers, num_cells, batches
+):
+    monkeypatch.setattr(store, "num_at_once", lambda *given: num_workers)
+    cells, calls = CELLS[:num_cells], Calls()
+    fill(tmp_path, cells, run=calls, runs_at_once=2, divisible=True)
+    assert calls.asked == [(cell, batch) for cell in cells for batch in batches]
+
+
+def test_batches_are_the_same_when_a_part_of_them_is_there(tmp_path):
+    """A check-point is that of its batch."""
+    calls = Calls()
+    fill(tmp_path, CELLS[:1], [0, 1])
+    fill(tmp_path, CELLS[:1], range(5), run=calls, runs_at_once=3)
+    assert calls.asked == [(CELLS[0], [2]), (CELLS[0], [3, 4])]
 
 
 @pytest.mark.parametrize(

@@ -424,4 +424,6 @@ def short(cell: Cell) -> Cell:
     return replace(cell, settings=settings, saved_after=(1,), curve_every=1)
 
 
-EXPERIMENT = Experiment(train_run, Cell, short, (0,), runs_at_once=5, checkpoints=checkpoints_of)
+EXPERIMENT = Experiment(
+    train_run, Cell, short, (0,), runs_at_once=5, divisible=True, checkpoints=checkpoints_of
+)
