@@ -3,7 +3,8 @@
     python tests/bench/bench_door.py [--blocks 6] [--steps 60] [--json PATH]
 
 CPU time is compared in short blocks that take turns, so that a busy machine slows all alike. What
-training needs is the published settings' rollout and updates, measured once and multiplied.
+training needs is the published settings' rollout and updates, measured once and multiplied: of one
+run alone, and of each of as many as are trained together.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ import torch
 from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
-from experiments.doors.training import CELLS, NETWORK, new_training
+from experiments.doors.training import CELLS, EXPERIMENT, NETWORK, new_training
 from experiments.sealed import write_record
 from ipo.worlds.many_doors import VectorDoor
 from ipo.worlds.one_door import DoorEnv
@@ -90,19 +91,19 @@ def simulation(num_steps: int, num_blocks: int) -> dict[str, list[float]]:
     return speeds
 
 
-def update_costs(method: str) -> dict[str, float]:
-    """CPU seconds of a published update: simulation, and what learning costs."""
-    training = new_training(CELLS[method], seed=0)
+def update_costs(method: str, num_runs: int) -> dict[str, float]:
+    """CPU seconds of a run's share in a published update: simulation, and what learning costs."""
+    training = new_training(CELLS[method], range(num_runs))
     costs = {"simulation": 0.0, "learning": 0.0}
     for d, collector in enumerate(training.collectors):
-        average = NETWORK.frozen(training.players)
+        average = training.learners.acting()
         start = time.process_time()
         rollout = collector.collect(average, NETWORK.distribution, training.draws)
         collected = time.process_time()
         training.improve(d, rollout.frames())
         costs["simulation"] += collected - start
         costs["learning"] += time.process_time() - collected
-    return costs
+    return {part: seconds / num_runs for part, seconds in costs.items()}
 
 
 def main() -> None:
@@ -123,16 +124,27 @@ def main() -> None:
     print("Steps of a door per CPU second, with the policy; ratios")
     for name, value in speeds.items():
         print(f"  {name:32}{value:12,.1f}")
-    costs = {method: update_costs(method) for method in ("ppo", "ipo")}
-    print("CPU minutes of 25 million steps")
-    for method, parts in costs.items():
-        minutes = {name: seconds * UPDATES / 60 for name, seconds in parts.items()}
-        text = ", ".join(f"{name} {value:.1f}" for name, value in minutes.items())
-        print(f"  {method:32}{sum(minutes.values()):12.1f}   ({text})")
+    runs_at_once = EXPERIMENT.runs_at_once
+    costs = {
+        method: {"alone": update_costs(method, 1), "together": update_costs(method, runs_at_once)}
+        for method in ("ppo", "ipo")
+    }
+    print(f"CPU minutes of 25 million steps of a run, alone and together with {runs_at_once - 1}")
+    for method, ways in costs.items():
+        for way, parts in ways.items():
+            minutes = {name: seconds * UPDATES / 60 for name, seconds in parts.items()}
+            text = ", ".join(f"{name} {value:.1f}" for name, value in minutes.items())
+            title = f"{method} {way}"
+            print(f"  {title:32}{sum(minutes.values()):12.1f}   ({text})")
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     print(f"Memory at its peak: {memory:.2f} GiB")
     if options.json:
-        numbers = {"speeds": speeds, "update_cpu_seconds": costs, "memory_gib": memory}
+        numbers = {
+            "speeds": speeds,
+            "update_cpu_seconds": costs,
+            "runs_at_once": runs_at_once,
+            "memory_gib": memory,
+        }
         write_record(options.json, numbers)
 
 

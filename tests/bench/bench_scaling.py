@@ -40,7 +40,7 @@ ONE_UPDATE = replace(DOOR.settings, num_updates=1)
 WHOLE = {
     "lqr/tables": (published_cell("ipo_variable_phi", 10, 1000, num_iterations=30), 10),
     "keys/main": (arm("ipo", "ipo", num_updates=1), 25),
-    "door/curves": (replace(DOOR, settings=ONE_UPDATE), 1),
+    "door/curves": (replace(DOOR, settings=ONE_UPDATE), 5),
 }
 SWEEP = WHOLE | {"door/curves": (replace(DOOR, settings=shorter(ONE_UPDATE)), 1)}
 NUM_OF_EACH = 2
