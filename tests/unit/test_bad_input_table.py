@@ -770,7 +770,7 @@ TRUSTING = {
     r"ipo\.own_domains\.networks\.(\w+\.(__call__|frozen|vjp)|VectorNetwork)": "as in ipo.networks",
     r"ipo\.rollouts\.check_device": "is a check itself; Training shows it",
     r"ipo\.own_domains\.default_settings": "PPOSettings checks",
-    r"ipo\.network_players\.(in_one_row|NetworkPlayers\.(others|vjp|step))": LOOP,
+    r"ipo\.network_players\.(in_one_row|side_by_side|NetworkPlayers\.(others|vjp|step))": LOOP,
     r"ipo\.ppo\.(PPOSettings\.optimizer|Training\.(respond|improve))": LOOP,
     r"ipo\.ppo\.(minibatches|loss_gradient|gains|standardize)": LOOP,
     r"ipo\.(ppo|network_players|rollouts|worlds\.vector_environments)\.\w+\.restore": STATE,

@@ -131,7 +131,7 @@ def test_a_policy_acts_within_its_spaces_and_survives_its_file(tmp_path, observa
     evaluate_policy(again, lines(2, **spaces_), num_episodes=1)
     with pytest.raises(ValueError, match=r"observation: has shape \(4,\), must have"):
         policy.act(np.zeros(4))
-    with pytest.raises(ValueError, match="run = 2: must be between 0 and 1"):
+    with pytest.raises(ValueError, match="run = 2: must be at most 1"):
         policy.act(seen, run=2)
 
 
