@@ -22,6 +22,7 @@ from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
 from experiments.doors.training import CELLS, EXPERIMENT, NETWORK, new_training
+from experiments.origin import machine
 from experiments.sealed import write_record
 from ipo.worlds.many_doors import VectorDoor
 from ipo.worlds.one_door import DoorEnv
@@ -140,6 +141,7 @@ def main() -> None:
     print(f"Memory at its peak: {memory:.2f} GiB")
     if options.json:
         numbers = {
+            "machine": machine(),
             "speeds": speeds,
             "update_cpu_seconds": costs,
             "runs_at_once": runs_at_once,

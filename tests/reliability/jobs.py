@@ -76,7 +76,7 @@ class Sweep:
 
 
 class DoorTraining:
-    """Two runs of PPO on two doors, a check-point after every update."""
+    """Two runs of PPO on two doors, trained together, a check-point after every update."""
 
     settings = published_door(
         "ppo", num_updates=4, num_envs=(1, 1), num_steps=512, num_minibatches=2, num_epochs=1
@@ -105,12 +105,12 @@ class DoorTraining:
             seed for batch in Store(self.folder, "curves").batches() for seed in batch["seeds"]
         }
         for seed in self.seeds:
-            num_updates = 4 if seed in saved else self._num_updates(seed)
+            num_updates = 4 if seed in saved else self._num_updates()
             found |= {(seed, number) for number in range(num_updates)}
         return found
 
-    def _num_updates(self, seed: int) -> int:
-        path = checkpoint_path(self.cell, seed, self.places.checkpoints)
+    def _num_updates(self) -> int:
+        path = checkpoint_path(self.cell, self.seeds[0], self.places.checkpoints)
         while True:
             try:
                 return (load_checkpoint(path) or {"num_updates": 0})["num_updates"]

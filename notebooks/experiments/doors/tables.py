@@ -299,7 +299,7 @@ def table_of_choices(
     )
 
 
-def bench_numbers(bench: Mapping[str, Any], num_updates: int = 190) -> dict[str, float]:
+def bench_numbers(bench: Mapping[str, Any], num_updates: int = 190) -> dict[str, Any]:
     """Speeds and core-minutes of a training, from the record of the benchmark."""
     speeds = bench["speeds"]
     return {
@@ -307,6 +307,7 @@ def bench_numbers(bench: Mapping[str, Any], num_updates: int = 190) -> dict[str,
         "speed_fine": speeds["ratio to 0.001 s, 32 doors"],
         "speed_plain": speeds["ratio to 0.001 s, one by one"],
         "memory": bench["memory_gib"],
+        "machine": bench["machine"],
         "runs_at_once": bench["runs_at_once"],
     } | {
         f"core_{method}_{way}": sum(parts.values()) * num_updates / 60
