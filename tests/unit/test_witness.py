@@ -195,3 +195,20 @@ def test_experiments_that_were_copied_to_where_no_rows_are_say_how_to_install_th
     shutil.copy(origin.__file__, copied)
     with pytest.raises(FileNotFoundError, match=r"no shipped rows.* --editable notebooks"):
         runpy.run_path(str(copied))
+
+
+@pytest.mark.parametrize(
+    ("experiment", "metric", "by", "factor", "expected"),
+    [
+        ("door/curves", "return", 149.0, 1, True),
+        ("door/curves", "return", 151.0 + 6.0, 1, False),
+        ("door/curves", "return", 149.0 + 59.0, 10, True),
+        ("door/curves", "return", 1500.0, 10, False),  # what flips does so once
+        ("your_own_domains/compare", "return", 149.0, 1, False),
+        ("door/gaps", "after", 2000.0, 1, True),
+        ("door/gaps", "before", 2000.0, 1, False),
+    ],
+)
+def test_what_may_flip_is_named_by_its_metric(experiment, metric, by, factor, expected):
+    both = pd.DataFrame({"metric": [metric], "value": [-6000.0], "value_now": [-6000.0 + by]})
+    assert witness.within(both, experiment, factor).all() == expected
