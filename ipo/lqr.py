@@ -232,8 +232,8 @@ def _lyapunov_pair(M: Tensor, C: Tensor) -> tuple[Tensor, Tensor]:
 
         X <- X + Y'X Y,    Y <- Y Y.
 
-    Stops when the next terms are below rounding, which takes 4 to 10 doublings; to look whether
-    they are takes a fifth of the time of one.
+    Stops when the next terms are below rounding, which takes 4 to 10 doublings: before, it would
+    be a waste of time to look.
 
     Returns:
         P, S ``[systems, n, n]``. Where a series does not end, P is infinite and S is NaN: the cost
