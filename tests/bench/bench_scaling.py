@@ -24,7 +24,7 @@ from tempfile import TemporaryDirectory
 
 from threadpoolctl import threadpool_limits
 
-from experiments.doors.training import CELLS, shorter
+from experiments.doors.training import CELLS, EXPERIMENT, shorter
 from experiments.experiment import Cell, Places
 from experiments.keys import arm
 from experiments.lqr import published_cell
@@ -40,7 +40,7 @@ ONE_UPDATE = replace(DOOR.settings, num_updates=1)
 WHOLE = {
     "lqr/tables": (published_cell("ipo_variable_phi", 10, 1000, num_iterations=30), 10),
     "keys/main": (arm("ipo", "ipo", num_updates=1), 25),
-    "door/curves": (replace(DOOR, settings=ONE_UPDATE), 5),
+    "door/curves": (replace(DOOR, settings=ONE_UPDATE), EXPERIMENT.runs_at_once),
 }
 SWEEP = WHOLE | {"door/curves": (replace(DOOR, settings=shorter(ONE_UPDATE)), 1)}
 NUM_OF_EACH = 2

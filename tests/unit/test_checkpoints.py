@@ -169,10 +169,10 @@ def test_a_checkpoint_of_other_settings_or_runs_is_refused(tmp_path):
     cell = small("ppo")
     Runs(cell, [0], tmp_path, tmp_path).update()
     other = replace(cell, settings=replace(cell.settings, learning_rate=0.1))
-    refused = r"was made for others: .*learning_rate = 0\.001, asked for 0\.1; delete it"
+    refused = r"was made for others: .*learning_rate = 0\.001, asked for 0\.1; ask for the same"
     with pytest.raises(CheckpointError, match=refused):
         Runs(other, [0], tmp_path, tmp_path)
-    with pytest.raises(CheckpointError, match=r"seeds = \[0\], asked for \[0, 1\]; delete it"):
+    with pytest.raises(CheckpointError, match=r"seeds = \[0\], asked for \[0, 1\]; ask for"):
         Runs(cell, [0, 1], tmp_path, tmp_path)
 
 

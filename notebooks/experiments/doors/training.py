@@ -284,7 +284,8 @@ class Runs:
     def _restore(self, state: dict[str, Any]) -> None:
         if differs := difference(state["identity"], self.identity):
             raise CheckpointError(
-                f"{self.checkpoint}: was made for others: {differs}; delete it to begin anew"
+                f"{self.checkpoint}: was made for others: {differs}; ask for the same, with as "
+                "many workers, or delete it to begin anew"
             )
         self.training.restore(state["training"])
         for name in ("num_updates", "cpu_seconds", "best_returns", "best", "curve"):
