@@ -1,5 +1,6 @@
 """Evaluation of policies on doors: the same doors for everyone, and rows as agreed."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -111,6 +112,13 @@ def test_runs_of_the_same_seed_have_the_same_doors_without_friction():
         return doors.envs.params[:4]
 
     assert first_doors([0, 1], [4, 2]) == first_doors([0], [4])
+
+
+def test_the_wide_network_has_as_many_weights_as_two():
+    def size(label):
+        return sum(math.prod(shape) for shape in CELLS[label].network.weight_shapes.values())
+
+    assert size("ppo_wide_same_doors") == pytest.approx(2 * size("ipo"), rel=0.01)
 
 
 @pytest.mark.parametrize("label", ["ppo_same_doors", "ensemble_same_doors", "in_turn"])

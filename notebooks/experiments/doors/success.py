@@ -109,7 +109,9 @@ def evaluate(cell: Cell, seeds: Sequence[int], policies: str | Path) -> pd.DataF
     for seed in seeds:
         players = load_players(cell, seed, policies)
         for friction in cell.frictions:
-            found = last_info(players, friction, cell.num_doors, EVALUATION_SEED)
+            found = last_info(
+                players, friction, cell.num_doors, EVALUATION_SEED, cell.trained.network
+            )
             parts.append(
                 pd.DataFrame(
                     {

@@ -73,6 +73,7 @@ class Cell:
             would be the same: its random streams do not depend on how long it will last.
         curve_every: updates between two looks at a friction that is not trained on.
         same_doors: the doors are IPO's, whoever learns from them; see :class:`SameDoors`.
+        hidden: units of each hidden layer.
     """
 
     label: str
@@ -80,6 +81,7 @@ class Cell:
     saved_after: tuple[Count, ...] = (95, 190)
     curve_every: Count = 10
     same_doors: bool = False
+    hidden: tuple[Count, ...] = (64, 64)
 
     def __post_init__(self) -> None:
         check_file_name("label", self.label)  # of policies and check-points
@@ -91,6 +93,10 @@ class Cell:
                 )
 
     @property
+    def network(self) -> DenseInNumpy:
+        return DenseInNumpy(15, 6, Gaussian, self.hidden)
+
+    @property
     def columns(self) -> dict[str, Any]:
         return {"method": self.label, "train_frictions": "+".join(map(str, TRAIN_FRICTIONS))}
 
@@ -100,7 +106,8 @@ def controls(num_updates: int = 95, curve_every: int = 10, **changes: Any) -> di
 
     They end where the published training of IPO did: the ensemble, whose players learn from all
     doors; one network that learns from one domain at a time; IPO with PPO's learning rate. The
-    latter two have IPO's doors by themselves; PPO and the ensemble are there with them, too.
+    latter two have IPO's doors by themselves. With the same doors: PPO, PPO with one network of as
+    many weights as IPO's two, and the ensemble.
     """
 
     def control(label: str, method: str, learning_rate: float, **options: Any) -> Cell:
@@ -114,6 +121,7 @@ def controls(num_updates: int = 95, curve_every: int = 10, **changes: Any) -> di
         control("in_turn", "in_turn", 5e-4),
         control("ipo_lr1e-3", "ipo", 1e-3),
         control("ppo_same_doors", "ppo", 1e-3, same_doors=True),
+        control("ppo_wide_same_doors", "ppo", 1e-3, same_doors=True, hidden=(94, 94)),
         control("ensemble_same_doors", "ensemble", 5e-4, same_doors=True),
     ]
     return {cell.label: cell for cell in cells}
@@ -250,7 +258,7 @@ class Runs:
 
     def _successes(self) -> list[float]:
         """What share of the same fresh doors each run opens by its most likely actions."""
-        door = CURVE_FRICTION, NUM_CURVE_DOORS, CURVE_SEED
+        door = CURVE_FRICTION, NUM_CURVE_DOORS, CURVE_SEED, self.cell.network
         players = [of_run(self.training.players, r) for r in range(len(self.seeds))]
         return [last_info(own, *door)["opened"].mean() for own in players]
 
@@ -295,7 +303,7 @@ class Runs:
 def new_training(cell: Cell, seeds: Sequence[int]) -> Training:
     """Runs of training on doors, from their start."""
     doors = SameDoors() if cell.same_doors else make_doors
-    return Training(NETWORK, doors, len(TRAIN_FRICTIONS), cell.settings, seeds)
+    return Training(cell.network, doors, len(TRAIN_FRICTIONS), cell.settings, seeds)
 
 
 def make_doors(domains: list[int], num_copies: list[int], generators: Generators) -> FromGymnasium:
@@ -347,7 +355,12 @@ def seeds_of(stream: np.random.SeedSequence, number: int) -> list[int]:
 
 
 def last_info(
-    players: Sequence[Weights], friction: float, num_doors: int, seed: int, **options: Any
+    players: Sequence[Weights],
+    friction: float,
+    num_doors: int,
+    seed: int,
+    network: DenseInNumpy = NETWORK,
+    **options: Any,
 ) -> dict[str, np.ndarray]:
     """What the players' average makes of fresh doors in one episode, by its most likely actions.
 
@@ -359,7 +372,7 @@ def last_info(
     """
     doors = VectorDoor([friction] * num_doors, **options)
     try:
-        policy = NETWORK.frozen(players)
+        policy = network.frozen(players)
         observations, _ = doors.reset(seed=seed)
         while True:
             rows = torch.tensor(observations, dtype=torch.float32).unsqueeze(0)
@@ -398,7 +411,7 @@ def load_players(
 ) -> list[Weights]:
     """The players of a run, from its file."""
     path = policy_path(folder, cell.label, seed, num_updates, choice)
-    return load_policy(path, NETWORK, made_for(cell, seed, num_updates, choice))[0]
+    return load_policy(path, cell.network, made_for(cell, seed, num_updates, choice))[0]
 
 
 def shorter(settings: PPOSettings) -> PPOSettings:
