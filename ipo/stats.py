@@ -102,6 +102,20 @@ def power(effect: Finite, spread: Positive, num_runs: Count) -> float:
 
 
 @checked
+def runs_needed(effect: Positive, spread: Positive) -> int:
+    """The fewest runs of each method whose :func:`power` is 80 %.
+
+    The search begins at what a normal distribution needs, ((z_0.975 + z_0.8) spread / effect)^2,
+    which is never more.
+    """
+    z = scipy.stats.norm.ppf([0.975, 0.8]).sum()
+    num_runs = max(2, int((z * spread / effect) ** 2))
+    while power(effect, spread, num_runs) < 0.8:
+        num_runs += 1
+    return num_runs
+
+
+@checked
 def probability_of_improvement(costs: Runs, baseline: Runs) -> float:
     """Probability that a run of the method costs less than a run of the baseline.
 

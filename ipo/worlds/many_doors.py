@@ -28,6 +28,7 @@ from ipo.worlds.door import (
     shift_handle,
     substeps,
 )
+from ipo.worlds.seeds import seeds_of
 
 
 class VectorDoor(gym.vector.VectorEnv):
@@ -164,8 +165,7 @@ class VectorDoor(gym.vector.VectorEnv):
                     f"seed: names {len(seed)} seeds, must be {self.num_envs}, one a door"
                 )
             return seed
-        streams = np.random.SeedSequence(seed).spawn(self.num_envs)
-        return [int(stream.generate_state(1)[0]) for stream in streams]
+        return seeds_of(np.random.SeedSequence(seed), self.num_envs)
 
     def _build(self, params: list[DoorParams]) -> None:
         self.params = params

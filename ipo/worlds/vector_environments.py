@@ -11,6 +11,7 @@ from gymnasium.vector import VectorEnv
 from torch import Tensor
 
 from ipo.rollouts import Step
+from ipo.worlds.seeds import seeds_of
 
 
 class FromGymnasium:
@@ -30,9 +31,7 @@ class FromGymnasium:
             raise ValueError(f"envs: {envs.num_envs} copies, must be a multiple of {num_runs} runs")
         self.envs, self.num_runs = envs, num_runs
         if not isinstance(seed, Sequence):
-            # Gymnasium's own seeds s, s + 1, ... would give neighbouring runs the same streams.
-            streams = np.random.SeedSequence(seed).spawn(envs.num_envs)
-            seed = [int(stream.generate_state(1)[0]) for stream in streams]
+            seed = seeds_of(np.random.SeedSequence(seed), envs.num_envs)
         if len(seed) != envs.num_envs:
             raise ValueError(f"seed: {len(seed)} seeds, must be one for each of {envs.num_envs}")
         self.seeds = seed

@@ -15,7 +15,7 @@ from experiments.keys import ARMS, INSIDE, MAIN, TESTED, TRAINED, Keys, in_words
 from experiments.tables import mean_and_std
 from experiments.visits import occupancy
 from ipo.networks import Weights
-from ipo.stats import paired_difference, probability_of_improvement
+from ipo.stats import paired_difference, probability_of_improvement, runs_needed
 from ipo.worlds.colored_keys import COLORS
 from ipo.worlds.tabular import TabularTask, expected_return
 
@@ -122,14 +122,13 @@ def draws_of_ten(
     return drawn
 
 
-def runs_needed(rows: pd.DataFrame, difference: float) -> int:
+def runs_for(difference: float, rows: pd.DataFrame) -> int:
     """Runs of IPO and of PPO that find such a difference on grey with a power of 80 % at 5 %.
 
-    n = 2 s^2 ((z_0.975 + z_0.8) / difference)^2,    s^2: variance over runs, mean of both arms
+    Runs are not paired: the variances of both arms add up.
     """
-    variance = np.mean([values.var() for values in _on_grey(rows, "ipo", "ppo")])
-    z = scipy.stats.norm.ppf([0.975, 0.8]).sum()
-    return int(np.ceil(2 * variance * (z / difference) ** 2))
+    variance = sum(values.var() for values in _on_grey(rows, "ipo", "ppo"))
+    return runs_needed(difference, np.sqrt(variance))
 
 
 def p_of_spreads(rows: pd.DataFrame, metric: str) -> float:

@@ -224,6 +224,7 @@ def rows_of_lqr() -> Iterator[Row]:
     yield row(
         stats.power, {"effect": 1.0, "spread": 2.0, "num_runs": 10}, effect=NUMBER, spread=POSITIVE
     )
+    yield row(stats.runs_needed, {"effect": 1.0, "spread": 2.0}, effect=POSITIVE, spread=POSITIVE)
     improvement = {"costs": [1.0, 2.0], "baseline": [1.0, 2.0]}
     yield row(stats.probability_of_improvement, improvement, costs=values, baseline=values)
 
@@ -777,6 +778,7 @@ TRUSTING = {
     r"ipo\.rollouts\.(Step|Rollout)": RECORD,
     r"ipo\.(stats\.Difference|game\.Move)": RECORD,
     r"ipo\.worlds\.vector_environments\.FromGymnasium\.step": LOOP,
+    r"ipo\.worlds\.seeds\.seeds_of": "of a stream and a number of environments, both checked",
     r"ipo\.rollouts\.(\w+\.step|\w+\.__call__|Collector\.collect)": LOOP,
     r"ipo\.rollouts\.(value_errors|advantages)": LOOP,
     r"ipo\.causality\.icp\.ICPResult": RECORD,

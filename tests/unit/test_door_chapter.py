@@ -26,7 +26,6 @@ from experiments.doors.arms import (
 from experiments.doors.success import door_seeds, evaluation_doors
 from experiments.doors.training import NETWORK, made_for, policy_path
 from experiments.policies import save_policy
-from ipo.stats import power
 from ipo.worlds.one_door import DoorEnv
 
 FRICTIONS = (1.1, 1.5)
@@ -151,11 +150,6 @@ def test_controls_are_paired_with_the_runs_of_ipo_that_they_have(success):
         assert differences[method] == pytest.approx(12.5 - 100 * by)
     assert table.set_index("key").loc["in_turn", "it opens"] == "37.5 ± 12.5"
     assert table["power"].between(0.05, 1).all()
-
-
-@pytest.mark.parametrize("spread", [9.0, 14.0])
-def test_pairs_needed_have_the_stated_power(spread):
-    assert power(3.0, spread, door_tables.pairs_needed(3.0, spread)) == pytest.approx(0.8, abs=0.01)
 
 
 def test_runs_are_compared_in_pairs():

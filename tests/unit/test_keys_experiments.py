@@ -636,13 +636,13 @@ def test_draws_are_of_the_published_protocol_and_of_each_methods_own_runs():
         assert abs(drawn[method].mean() - np.mean(runs)) < 5 * error
 
 
-def test_runs_needed_have_the_stated_power():
+def test_runs_for_a_difference_have_the_stated_power():
     """Normal samples of so many runs: the two-sample test finds the difference in 80 %."""
     rng = np.random.default_rng(0)
     values = rng.normal(size=(2, 1000))
     values = (values - values.mean(1, keepdims=True)) / values.std(1, ddof=1, keepdims=True)
     rows = made_up({("ipo", "grey"): 2 * values[0], ("ppo", "grey"): 0.5 * values[1]})
-    needed = keys_tables.runs_needed(rows, 0.5)
+    needed = keys_tables.runs_for(0.5, rows)
     one, other = rng.normal(0.5, 2, (4000, needed)), rng.normal(0, 0.5, (4000, needed))
     found = scipy.stats.ttest_ind(one, other, axis=1, equal_var=False).pvalue < 0.05
     assert found.mean() == pytest.approx(0.8, abs=0.03)

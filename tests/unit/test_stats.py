@@ -6,7 +6,13 @@ import scipy.stats
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ipo.stats import mean_interval, paired_difference, power, probability_of_improvement
+from ipo.stats import (
+    mean_interval,
+    paired_difference,
+    power,
+    probability_of_improvement,
+    runs_needed,
+)
 
 RUNS = np.array([78.1, 80.4, 69.9, 85.2, 77.7, 81.3, 74.6, 79.0, 90.5, 72.2])
 whole_costs = st.lists(st.integers(0, 5).map(float), min_size=2, max_size=12)  # with many ties
@@ -68,6 +74,12 @@ def test_power_is_how_often_the_interval_leaves_zero_out(effect, num_runs):
     samples = np.random.default_rng(1).normal(effect, 1, size=(20_000, num_runs))
     found = (scipy.stats.ttest_1samp(samples, 0, axis=1).pvalue < 0.05).mean()
     assert power(effect, 1.0, num_runs) == pytest.approx(found, abs=0.012)
+
+
+@pytest.mark.parametrize(("effect", "spread"), [(5.0, 1.0), (2.0, 1.0), (3.0, 9.0), (3.0, 14.0)])
+def test_runs_needed_are_the_fewest_with_a_power_of_80_percent(effect, spread):
+    enough = [n for n in range(2, 250) if power(effect, spread, n) >= 0.8]
+    assert runs_needed(effect, spread) == enough[0]
 
 
 @given(whole_costs, whole_costs)

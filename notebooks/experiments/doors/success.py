@@ -26,7 +26,6 @@ from experiments.doors.training import (
     TRAIN_FRICTIONS,
     last_info,
     policy_path,
-    seeds_of,
 )
 from experiments.experiment import Experiment
 from ipo.checks import Count, Natural, NonNegative, check_choice, check_count, checked
@@ -34,6 +33,7 @@ from ipo.distributions import Gaussian
 from ipo.networks import Weights
 from ipo.worlds.door import DoorParams
 from ipo.worlds.one_door import DoorEnv
+from ipo.worlds.seeds import seeds_of
 
 TEST_FRICTIONS = (1.1, 1.2, 1.3, 1.4, 1.5)  # of the paper's Table 4
 NUM_DOORS = 200

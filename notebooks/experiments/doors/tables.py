@@ -5,7 +5,6 @@ Numbers are dictionaries for :func:`experiments.chapter.numbers`.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +13,6 @@ from typing import Any
 import joblib
 import numpy as np
 import pandas as pd
-import scipy.stats
 
 from experiments.doors.arms import (
     CONTROLS,
@@ -31,7 +29,7 @@ from experiments.doors.training import CURVE_FRICTION, EVALUATION_SEED, TRAIN_FR
 from experiments.tables import mean_and_std
 from experiments.work import parallel
 from ipo.ppo import PPOSettings
-from ipo.stats import paired_difference, power, probability_of_improvement
+from ipo.stats import paired_difference, power, probability_of_improvement, runs_needed
 
 PAIRS = {
     "published": ("ipo_half", "ppo"),
@@ -202,19 +200,10 @@ def controlled(
                 "95 %": f"[{found.low:+.1f}, {found.high:+.1f}]",
                 "p": found.p,
                 "power": power(effect, spread, len(runs)) if spread else 1.0,
-                "needed": pairs_needed(effect, spread),
+                "needed": runs_needed(effect, spread) if spread else 2,
             }
         )
     return pd.DataFrame(rows)
-
-
-def pairs_needed(effect: float, spread: float) -> int:
-    """Pairs that find an effect with a power of 80 % at 5 %, where differences have this spread.
-
-    n = (s (z_0.975 + z_0.8) / effect)^2,    at least 2
-    """
-    z = scipy.stats.norm.ppf([0.975, 0.8]).sum()
-    return max(2, math.ceil((spread * z / effect) ** 2))
 
 
 def control_numbers(controlled: pd.DataFrame) -> dict[str, Any]:

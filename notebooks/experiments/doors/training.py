@@ -28,6 +28,7 @@ from ipo.distributions import Gaussian, Generators
 from ipo.networks import Weights, copied, of_run
 from ipo.ppo import PPOSettings, Training
 from ipo.worlds.many_doors import VectorDoor
+from ipo.worlds.seeds import seeds_of
 from ipo.worlds.vector_environments import FromGymnasium
 
 TRAIN_FRICTIONS = (0.0, 0.1)
@@ -347,11 +348,6 @@ def _doors(domains: list[int], num_copies: list[int], seeds: list[list[int]]) ->
 
 def new_stream(generator: np.random.Generator) -> np.random.SeedSequence:
     return np.random.SeedSequence(int(generator.integers(2**63)))
-
-
-def seeds_of(stream: np.random.SeedSequence, number: int) -> list[int]:
-    """The next seeds of a stream."""
-    return [int(own.generate_state(1)[0]) for own in stream.spawn(number)]
 
 
 def last_info(
