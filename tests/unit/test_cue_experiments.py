@@ -211,6 +211,13 @@ def test_vrex_stands_once_with_the_penalty_of_its_training_domains():
     assert mean["0.9 0.7", "vrex"] == pytest.approx(0.2, abs=0.01)
 
 
+def test_methods_of_all_cells_have_a_name():
+    cells = ASKED["two_domains"]
+    names = {cell.columns["method"]: outcomes.name_of(cell.columns["method"]) for cell in cells}
+    assert names["in_turn"] == "one network, one domain at a time"
+    assert names["vrex_10"] == "V-REx, weight 10"
+
+
 def test_returns_in_training_are_between_those_at_the_extremes():
     """Cues 0.9 and -0.3, mean 0.3: 0.35 of the way down from the right cue to the wrong one."""
     rows = rows_of({("0.9 -0.3", "ppo"): (0.1, 0.9)})

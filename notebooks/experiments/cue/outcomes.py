@@ -39,6 +39,12 @@ def by_run(rows: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame({"worst": worst, "plain": plain, "use": right - wrong})
 
 
+def name_of(method: str) -> str:
+    """As readers know it, with the weight of the penalty if the method of the rows has one."""
+    plain, _, penalty = method.partition("vrex_")
+    return f"{NAMES['vrex']}, weight {penalty}" if penalty else NAMES[plain]
+
+
 def with_chosen_penalty(runs: pd.DataFrame) -> pd.DataFrame:
     """The same with V-REx once: with the penalty that the training domains of a point choose."""
     flat = runs.reset_index()
