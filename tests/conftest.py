@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -10,9 +11,20 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 def pytest_collection_modifyitems(items) -> None:
-    """Tests of the site wait until it is built: others first; unit tests fill what is left."""
-    folders = {"site": 1, "unit": 2}
-    items.sort(key=lambda item: folders.get(item.path.parent.name, 0))
+    """One file asks for the site, so that a worker builds it; the others of that kind come last.
+
+    Else the other worker would wait. Of those that come last, the one with the most tests is first,
+    so that the workers end together.
+    """
+    num_tests = Counter(item.path for item in items)
+    of_site = {item.path for item in items if "smoke_build" in item.fixturenames}
+    first = next((item.path for item in items if item.path in of_site), None)
+
+    def place(item) -> tuple[bool, bool, int]:
+        last = item.path in of_site and item.path != first
+        return item.path != first, last, -num_tests[item.path] if last else 0
+
+    items.sort(key=place)
 
 
 @pytest.fixture(scope="session")
