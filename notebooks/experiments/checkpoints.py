@@ -82,11 +82,6 @@ def previous(path: str | Path) -> Path:
     return path.with_name(f"{path.name}.previous")
 
 
-def files_of(path: Path) -> list[Path]:
-    """The check-point, the one before, and what a killed program may have left."""
-    return [path, previous(path), _new(path)]
-
-
 def _new(path: Path) -> Path:
     """Where a check-point is written, before it takes the place of the present one."""
     return path.with_name(f"{path.name}.new")

@@ -65,9 +65,9 @@ class Experiment:
         runs_at_once: runs of a cell that are computed, and saved, together; ``None``: all.
         divisible: whether fewer are, where workers would have nothing to do otherwise. A run must
             not depend on those beside it then.
-        checkpoints: ``checkpoints(cell, seed)`` are the files that carry the work of a run. It is
-            not the run that removes them but the store, when the rows are saved and read back.
-            ``None``: nothing is kept on the way.
+        checkpoints: ``checkpoints(cell)`` are the files that carry work, by the runs that were
+            begun together and go on together. It is not the run that removes them but the store,
+            when the rows are saved and read back. ``None``: nothing is kept on the way.
         earlier: ``earlier(cell)`` is the cell a little before the end of its training, or None if
             it is not trained: what moves until then is not at rest, and ``make confirm`` cannot
             ask for the same digits. ``None``: all cells come to rest.
@@ -80,7 +80,7 @@ class Experiment:
     reads: Callable[..., list[Path]] | None = None
     runs_at_once: Count | None = None
     divisible: bool = False
-    checkpoints: Callable[..., list[Path]] | None = None
+    checkpoints: Callable[..., dict[tuple[int, ...], list[Path]]] | None = None
     earlier: Callable[[Any], Any | None] | None = None
 
     def at(self, places: Places) -> Experiment:

@@ -19,7 +19,6 @@ import heapq
 import sys
 from collections.abc import Iterable, Sequence
 from functools import partial
-from typing import Any
 
 import pandas as pd
 import scipy.stats
@@ -28,7 +27,7 @@ from tqdm import tqdm
 from experiments.confirm import CHAOTIC, LEVEL, agreement
 from experiments.experiment import Cell, Experiment, Places, rebuilt
 from experiments.registry import CHAPTERS, DATA, chosen
-from experiments.store import Batch, Store, select, timed
+from experiments.store import Batch, Store, select, timed, together
 from experiments.witness import Slice
 from experiments.work import finished, num_at_once
 from ipo.checks import check_choice
@@ -116,16 +115,20 @@ def compute(
     waiting.sort(key=lambda pair: -cost(pair[0]))  # long ones first: no idle core
     for part, _ in waiting:
         store(part).check_writable()
-    jobs = [partial(_computed, part, seeds) for part, seeds in waiting]
-    for part, cell, rows, made in finished(jobs, num_workers, scheduler):
+    jobs = [
+        partial(_computed, part, runs, len(runs) / len(seeds))
+        for part, seeds in waiting
+        for runs in together(experiment(part), cell_of(part), seeds, seeds, len(seeds))
+    ]
+    for part, runs, share, (cell, rows, made) in finished(jobs, num_workers, scheduler):
         store(part).add(experiment(part), cell, rows, made)
-        store(part).remove_checkpoints(experiment(part), [cell], part.batch["seeds"])
+        store(part).remove_checkpoints(experiment(part), [cell], runs)
         bar.set_postfix_str(f"{part.chapter}/{part.name}", refresh=False)
-        bar.update(cost(part))
+        bar.update(cost(part) * share)
 
 
-def _computed(part: Slice, seeds: list[int]) -> tuple[Slice, Cell, pd.DataFrame, dict[str, Any]]:
-    return part, *timed(experiment(part).run, cell_of(part), seeds)
+def _computed(part: Slice, runs: list[int], share: float) -> tuple[Slice, list[int], float, tuple]:
+    return part, runs, share, timed(experiment(part).run, cell_of(part), runs)
 
 
 def cell_of(part: Slice) -> Cell:

@@ -16,7 +16,6 @@ import csv
 import datetime
 import hashlib
 import io
-import itertools
 import json
 import math
 import os
@@ -136,10 +135,9 @@ class Store:
                 at_once = num_at_once(num_workers, scheduler)
                 size = min(size, math.ceil(len(cells) * len(seeds) / at_once))
             missing = [
-                (cell, together)
+                (cell, own)
                 for cell, runs in lacking
-                for i in range(0, len(seeds), size)
-                if (together := [seed for seed in seeds[i : i + size] if seed in runs])
+                for own in together(experiment, cell, seeds, runs, size)
             ]
             jobs = [partial(timed, experiment.run, cell, runs) for cell, runs in missing]
             work = finished(jobs, num_workers, scheduler)
@@ -158,12 +156,17 @@ class Store:
         """Remove what carried work, now that its rows can be read from the files."""
         if experiment.checkpoints is None:
             return
-        runs = itertools.product(cells, seeds)
-        paths = {path for cell, seed in runs for path in experiment.checkpoints(cell, seed)}
-        if there := [path for path in paths if path.exists()]:
+        paths = [
+            path
+            for cell in cells
+            for runs, files in experiment.checkpoints(cell).items()
+            if set(runs) <= set(seeds)
+            for path in files
+        ]
+        if paths:
             self._read()
-            for path in there:
-                path.unlink()
+            for path in paths:
+                path.unlink(missing_ok=True)  # two programs may fill the same files
 
     def lacking(self, experiment: Experiment, cell: Cell, seeds: Sequence[int]) -> list[int]:
         """The runs of a cell that are not there yet.
@@ -364,6 +367,18 @@ def asked(experiment: Experiment, cell: Cell, seeds: Sequence[int]) -> dict[str,
     paths = [path for seed in seeds for path in reads(cell, seed)]
     digests = {path.name: digest_of(path) for path in paths}
     return plain({"cell": cell, "run": name, "options": options, "reads": digests})
+
+
+def together(
+    experiment: Experiment, cell: Cell, seeds: Sequence[int], missing: Sequence[int], size: int
+) -> list[list[int]]:
+    """The missing runs of a cell: those that were begun together, and so many of ``seeds`` each."""
+    carried = experiment.checkpoints(cell) if experiment.checkpoints else ()
+    begun = [list(runs) for runs in carried if set(runs) <= set(missing)]
+    others = set(missing).difference(*begun)
+    slices = [seeds[i : i + size] for i in range(0, len(seeds), size)]
+    divided = [[seed for seed in part if seed in others] for part in slices]
+    return begun + [runs for runs in divided if runs]
 
 
 def select(rows: pd.DataFrame, columns: dict[str, Any]) -> pd.DataFrame:

@@ -110,7 +110,7 @@ class DoorTraining:
         return found
 
     def _num_updates(self) -> int:
-        path = checkpoint_path(self.cell, self.seeds[0], self.places.checkpoints)
+        path = checkpoint_path(self.cell, self.seeds, self.places.checkpoints)
         while True:
             try:
                 return (load_checkpoint(path) or {"num_updates": 0})["num_updates"]

@@ -165,15 +165,36 @@ def test_a_shorter_training_is_the_beginning_of_a_longer_one(tmp_path):
     assert without_time(short).equals(without_time(long)[: len(without_time(short))])
 
 
-def test_a_checkpoint_of_other_settings_or_runs_is_refused(tmp_path):
+def test_a_checkpoint_of_other_settings_is_refused(tmp_path):
     cell = small("ppo")
     Runs(cell, [0], tmp_path, tmp_path).update()
     other = replace(cell, settings=replace(cell.settings, learning_rate=0.1))
-    refused = r"was made for others: .*learning_rate = 0\.001, asked for 0\.1; ask for the same"
+    refused = r"was made for others: .*learning_rate = 0\.001, asked for 0\.1; delete it"
     with pytest.raises(CheckpointError, match=refused):
         Runs(other, [0], tmp_path, tmp_path)
-    with pytest.raises(CheckpointError, match=r"seeds = \[0\], asked for \[0, 1\]; ask for"):
-        Runs(cell, [0, 1], tmp_path, tmp_path)
+
+
+def test_a_checkpoint_of_other_runs_is_refused(tmp_path):
+    """Whoever asks for one of them, or for others besides, would begin it anew without a word."""
+    Runs(small("ppo"), [0, 1], tmp_path, tmp_path).update()
+    for asked in ([0], [1, 2]):
+        with pytest.raises(CheckpointError, match=r"ppo_0-1\.checkpoint: carries runs \[0, 1\]"):
+            Runs(small("ppo"), asked, tmp_path, tmp_path)
+
+
+def test_runs_that_two_workers_began_go_on_with_one(tmp_path, monkeypatch):
+    cell, updated = small("ppo", 2), []
+    places = Places(tmp_path, tmp_path / "policies", tmp_path / "checkpoints")
+    for together in ([0, 1], [2]):
+        Runs(cell, together, places.checkpoints, places.policies).update()
+    update = Runs.update
+    monkeypatch.setattr(Runs, "update", lambda runs: (updated.append(runs.seeds), update(runs)))
+    rows = Store(tmp_path / "rows", "curves").fill(
+        door_training.EXPERIMENT.at(places), [cell], [0, 1, 2], num_workers=1
+    )
+    assert updated == [[0, 1], [2]]
+    assert set(rows["run"]) == {0, 1, 2}
+    assert list(places.checkpoints.iterdir()) == []
 
 
 @pytest.mark.parametrize("method", ["ppo", "ipo"])

@@ -488,15 +488,15 @@ def test_work_is_kept_until_its_rows_are_read_back(tmp_path, complete, monkeypat
 
     @functools.wraps(toy_experiment.run)
     def run(cell, seeds):
-        (seed,) = seeds
-        (path,) = files(cell, seed)
+        path = tmp_path / f"{cell.method}_{cell.size}_{seeds[0]}.work"
         if not path.exists():
             begun.append(path.name)
             path.write_bytes(pickle.dumps(toy_experiment.run(cell, seeds)))
         return pickle.loads(path.read_bytes())
 
-    def files(cell, seed):
-        return [tmp_path / f"{cell.method}_{cell.size}_{seed}.work"]
+    def files(cell):
+        found = tmp_path.glob(f"{cell.method}_{cell.size}_*.work")
+        return {(int(path.stem.rpartition("_")[2]),): [path] for path in found}
 
     def full(*_):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -517,8 +517,30 @@ def test_work_is_kept_until_its_rows_are_read_back(tmp_path, complete, monkeypat
 def test_work_left_by_a_program_that_died_before_removing_it_goes(folder):
     path = folder / "left.work"
     path.write_text("work")
-    assert len(fill(folder, checkpoints=lambda cell, seed: [path])) == 18
+    assert len(fill(folder, checkpoints=lambda cell: {(0, 1): [path]})) == 18
     assert not path.exists()
+
+
+@pytest.mark.parametrize(
+    ("begun", "expected"),
+    [
+        ([], [[0, 1], [2, 3], [4]]),
+        ([(0, 1, 2), (3, 4)], [[0, 1, 2], [3, 4]]),  # by fewer workers
+        ([(1,), (3,)], [[1], [3], [0], [2], [4]]),  # by more
+        ([(4, 5), (6,)], [[0, 1], [2, 3], [4]]),  # not asked for, or not all
+    ],
+)
+def test_runs_go_on_together_as_they_were_begun(tmp_path, begun, expected):
+    computed = []
+
+    @functools.wraps(toy_experiment.run)
+    def run(cell, seeds):
+        computed.append(seeds)
+        return toy_experiment.run(cell, seeds)
+
+    options = {"run": run, "checkpoints": lambda cell: {runs: [] for runs in begun}}
+    fill(tmp_path, CELLS[:1], seeds=range(5), runs_at_once=2, **options)
+    assert computed == expected
 
 
 def test_record_is_json_that_others_can_read(folder):

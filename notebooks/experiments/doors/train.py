@@ -4,7 +4,7 @@
 
 Runs are trained side by side, one on each core or each worker of a dask scheduler; those that are
 finished are left alone. A run that ends adds its policies and its learning curve to ``data/``; one
-that is interrupted loses at most one update.
+that is interrupted loses at most one update, and may go on with more or fewer workers.
 """
 
 from __future__ import annotations

@@ -6,6 +6,7 @@ Test frictions are looked at while training, for the curves, but nothing depends
 from __future__ import annotations
 
 import itertools
+import re
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -18,7 +19,7 @@ import pandas as pd
 import torch
 from tqdm import tqdm
 
-from experiments.checkpoints import CheckpointError, files_of, load_checkpoint, save_checkpoint
+from experiments.checkpoints import CheckpointError, load_checkpoint, save_checkpoint
 from experiments.experiment import Experiment, difference, plain
 from experiments.files import check_file_name
 from experiments.policies import check_place, load_policy, save_policy
@@ -154,7 +155,8 @@ def train_run(
         the same fresh doors: ``success_most_likely``; ``cpu_seconds``, an equal share for each.
 
     Raises:
-        CheckpointError: a check-point of other settings or runs, or one that cannot be written.
+        CheckpointError: a check-point of other settings, or of some of these runs and others; one
+            that cannot be written.
         ValueError: policies of other settings are where these would be saved.
     """
     runs = Runs(cell, seeds, Path(checkpoints), Path(policies))
@@ -182,18 +184,25 @@ class Runs:
 
     def __init__(self, cell: Cell, seeds: Sequence[int], checkpoints: Path, policies: Path) -> None:
         self.cell, self.seeds, self.policies = cell, list(seeds), policies
-        self.checkpoint = checkpoint_path(cell, self.seeds[0], checkpoints)
+        self.checkpoint = checkpoint_path(cell, self.seeds, checkpoints)
         self.training = new_training(cell, seeds)
         self.num_updates = 0
         self.cpu_seconds = 0.0  # of each run
         self.best_returns = torch.full((len(self.seeds),), -torch.inf, dtype=torch.float64)
         self.best = copied(self.training.players)
         self.curve: list[list[Any]] = []  # frames, run, domain, metric, value
-        self.identity = plain({"settings": cell, "seeds": self.seeds})
+        self.identity = plain({"settings": cell})
         for seed in self.seeds:
             for updates in cell.saved_after:
                 for choice in CHOICES:
                     check_place(*self._policy(seed, updates, choice))
+        for runs in checkpoints_of(cell, checkpoints):
+            if list(runs) != self.seeds and not set(runs).isdisjoint(self.seeds):
+                raise CheckpointError(
+                    f"{checkpoint_path(cell, runs, checkpoints)}: carries runs {list(runs)}, asked "
+                    f"for {self.seeds}; ask for all of them, with as many workers as before, or "
+                    "delete it to begin anew"
+                )
         state = load_checkpoint(self.checkpoint)
         if state is not None:
             self._restore(state)
@@ -293,8 +302,7 @@ class Runs:
     def _restore(self, state: dict[str, Any]) -> None:
         if differs := difference(state["identity"], self.identity):
             raise CheckpointError(
-                f"{self.checkpoint}: was made for others: {differs}; ask for the same, with as "
-                "many workers, or delete it to begin anew"
+                f"{self.checkpoint}: was made for others: {differs}; delete it to begin anew"
             )
         self.training.restore(state["training"])
         for name in ("num_updates", "cpu_seconds", "best_returns", "best", "curve"):
@@ -380,13 +388,18 @@ def last_info(
         doors.close()
 
 
-def checkpoint_path(cell: Cell, seed: int, checkpoints: str | Path) -> Path:
-    """The check-point of runs that are trained together; the first one names it."""
-    return Path(checkpoints) / f"{cell.label}_{seed}.checkpoint"
+def checkpoint_path(cell: Cell, seeds: Sequence[int], checkpoints: str | Path) -> Path:
+    """The check-point of runs that are trained together."""
+    return Path(checkpoints) / f"{cell.label}_{'-'.join(map(str, seeds))}.checkpoint"
 
 
-def checkpoints_of(cell: Cell, seed: int, checkpoints: str | Path) -> list[Path]:
-    return files_of(checkpoint_path(cell, seed, checkpoints))
+def checkpoints_of(cell: Cell, checkpoints: str | Path) -> dict[tuple[int, ...], list[Path]]:
+    """The files of all check-points of a cell, the ones before among them, by their runs."""
+    name, found = re.compile(rf"{re.escape(cell.label)}_([\d-]+)\.checkpoint(\..+)?"), {}
+    for path in sorted(Path(checkpoints).glob("*.checkpoint*")):
+        if match := name.fullmatch(path.name):
+            found.setdefault(tuple(map(int, match[1].split("-"))), []).append(path)
+    return found
 
 
 def policy_path(
