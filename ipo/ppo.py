@@ -35,7 +35,9 @@ from ipo.rollouts import Collector, Device, Environments, Rollout, TimeOuts
 
 METHODS = ("ppo", "ipo", "ensemble", "in_turn")
 NORMALIZATIONS = ("none", "minibatch", "rollout")
+SCALES = ("player", "domain")
 
+Copies = Annotated[Sequence[Count], "domains"]  # how many of each domain
 # (domains, how many copies of each, a generator for each run) -> environments
 MakeEnvironments = Callable[[list[int], list[int], Generators], Environments]
 
@@ -64,8 +66,10 @@ class PPOSettings:
         value_weight, entropy_weight: of their terms in the loss.
         max_gradient_norm: bound on the norm of a player's gradient.
         discount, gae_lambda: gamma, and lambda of the advantage estimate.
-        normalize_rewards: by the standard deviation of the discounted return, each player's by
-            its own (:class:`ipo.rollouts.RewardNormalizer`).
+        normalize_rewards: by the standard deviation of the discounted return
+            (:class:`ipo.rollouts.RewardNormalizer`).
+        reward_scale: whose deviation that is: a ``player``'s, of all its domains, or that of each
+            ``domain``.
         reward_clip: bound on a normalised reward.
         normalize_advantages: to mean 0 and deviation 1, in each ``minibatch`` or once over the
             ``rollout``; or ``none``.
@@ -95,6 +99,7 @@ class PPOSettings:
     discount: Probability = 0.99
     gae_lambda: Probability = 0.95
     normalize_rewards: bool = False
+    reward_scale: Annotated[str, one_of(SCALES)] = "player"
     reward_clip: Positive = 10.0
     normalize_advantages: Annotated[str, one_of(NORMALIZATIONS)] = "none"
     time_outs: TimeOuts = "bootstrap"
@@ -148,11 +153,14 @@ class PPOSettings:
         return torch.optim.Adam([weights], rate, eps=epsilon, fused=True)
 
     @checked
-    def collector(self, environments: Environments, device: Device = "cpu") -> Collector:
-        """Of a player in its environments."""
+    def collector(
+        self, environments: Environments, copies: Copies, device: Device = "cpu"
+    ) -> Collector:
+        """Of a player in its environments, so many copies of each of its domains."""
         clip = self.reward_clip if self.normalize_rewards else None
+        scales = copies if self.reward_scale == "domain" else None
         sizes = self.num_steps, self.discount, self.gae_lambda
-        return Collector(environments, *sizes, self.time_outs, clip, device)
+        return Collector(environments, *sizes, self.time_outs, clip, scales, device)
 
 
 class Training:
@@ -160,7 +168,8 @@ class Training:
 
     Args:
         network: one player's outputs; its ``frozen(players)`` is the average that acts.
-        make_environments: ``(domains, num_copies, generators)`` -> so many copies of each domain.
+        make_environments: ``(domains, num_copies, generators)`` -> so many copies of each domain,
+            in their order.
         num_domains: training domains.
         settings: the method and how it is trained.
         seeds: R of them, one a run; every method draws the same streams from them.
@@ -213,7 +222,10 @@ class Training:
             make_environments(domains, own, self.resets)
             for domains, own in zip(owned, copies, strict=True)
         ]
-        self.collectors = [settings.collector(own, device) for own in environments]
+        self.collectors = [
+            settings.collector(own, number, device)
+            for own, number in zip(environments, copies, strict=True)
+        ]
 
     @property
     def players(self) -> list[Weights]:

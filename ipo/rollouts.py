@@ -5,6 +5,7 @@ Axes: R runs, N copies of the environments, T steps.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, NamedTuple, Protocol, runtime_checkable
 
@@ -17,6 +18,7 @@ from ipo.networks import Acting
 
 TIME_OUTS = ("bootstrap", "terminal", "no_advantage")
 TimeOuts = Annotated[str, one_of(TIME_OUTS)]
+Scales = Annotated[Sequence[Count], "scales"]
 
 
 class Step(NamedTuple):
@@ -50,22 +52,24 @@ class RewardNormalizer:
 
         G_t = r_t + gamma G_(t-1)  within an episode,    r_t' = clip(r_t / sd(G_0 ... G_t), -c, c)
 
-    The deviation is that of all copies and steps so far. As in the published runs, G looks back
-    and not ahead: it is only a measure of scale.
+    The deviation is that of all steps so far, in all copies or in some of them. As in the published
+    runs, G looks back and not ahead: it is only a measure of scale.
 
     Args:
-        num_runs, num_copies: R and N.
+        num_runs: R.
+        scales: how many copies share a deviation: the first ones, those that follow, and so on.
         discount: gamma.
         clip: the bound c.
     """
 
     @checked
     def __init__(
-        self, num_runs: Count, num_copies: Count, discount: Probability, clip: Positive
+        self, num_runs: Count, scales: Scales, discount: Probability, clip: Positive
     ) -> None:
-        self.discount, self.clip = discount, clip
-        self.discounted = torch.zeros(num_runs, num_copies, dtype=torch.float64)
-        self.moments = torch.zeros(3, num_runs, dtype=torch.float64)  # sums of 1, G and G^2
+        self.scales, self.discount, self.clip = list(scales), discount, clip
+        self.discounted = torch.zeros(num_runs, sum(scales), dtype=torch.float64)
+        # Sums of 1, G and G^2, for each deviation.
+        self.moments = torch.zeros(3, num_runs, len(scales), dtype=torch.float64)
 
     def __call__(self, rewards: Tensor, ended: Tensor) -> Tensor:
         """``rewards [R, N, T]`` of the next T steps, and where episodes end -> scaled rewards."""
@@ -78,11 +82,14 @@ class RewardNormalizer:
             discounted.append(self.discount * self.discounted + reward)
             self.discounted = on * discounted[-1]
         G = torch.stack(discounted, -1)  # [R, N, T]
-        sums = torch.stack([torch.ones_like(G), G, G.square()]).sum(2).cumsum(-1)
-        count, mean, square = sums + self.moments.unsqueeze(-1)  # each [R, T]
+        copies = torch.stack([torch.ones_like(G), G, G.square()]).split(self.scales, dim=2)
+        sums = torch.stack([own.sum(2) for own in copies], dim=2).cumsum(-1)
+        count, mean, square = sums + self.moments.unsqueeze(-1)  # each [R, scales, T]
         self.moments = torch.stack([count, mean, square])[..., -1]
         variance = (square / count - (mean / count).square()).clamp(min=0)
-        scaled = rewards / (variance + 1e-8).sqrt().unsqueeze(1).to(rewards)
+        deviation = (variance + 1e-8).sqrt().to(rewards)
+        of_copies = torch.tensor(self.scales, device=rewards.device)
+        scaled = rewards / deviation.repeat_interleave(of_copies, dim=1)
         return scaled.clamp(-self.clip, self.clip)
 
 
@@ -124,6 +131,7 @@ class Collector:
         gae_lambda: lambda of the advantage estimate.
         time_outs: see :class:`ipo.ppo.PPOSettings`.
         reward_clip: bound on normalised rewards; ``None``: they are not normalised.
+        scales: see :class:`RewardNormalizer`; ``None``: all copies share a deviation.
         device: of the policy and the rollouts; environments and their answers are on the CPU.
     """
 
@@ -133,6 +141,7 @@ class Collector:
     gae_lambda: Probability
     time_outs: TimeOuts = "bootstrap"
     reward_clip: Positive | None = None
+    scales: Scales | None = None
     device: Device = "cpu"
 
     def __post_init__(self) -> None:
@@ -140,9 +149,10 @@ class Collector:
         self.normalizer = None
         if self.reward_clip is not None:
             num_runs, num_copies = self.observation.shape[:2]
-            self.normalizer = RewardNormalizer(
-                num_runs, num_copies, self.discount, self.reward_clip
-            )
+            scales = self.scales or [num_copies]
+            if sum(scales) != num_copies:
+                raise ValueError(f"scales = {scales}: must be {num_copies} copies in all")
+            self.normalizer = RewardNormalizer(num_runs, scales, self.discount, self.reward_clip)
 
     def collect(
         self, policy: Acting, distribution: type[Distribution], generators: Generators

@@ -55,7 +55,8 @@ class Experiment:
 
     Attributes:
         run: ``run(cell, seeds)`` returns the rows, with the cell's columns and ``run``. It may be
-            a ``functools.partial``, whose options become part of the rows' origin.
+            a ``functools.partial``, whose options become part of the rows' origin. Where it went
+            on from a check-point, ``rows.attrs["earlier_cpu_seconds"]`` is what came before.
         cell: the class of the cells.
         short: the slice of a cell that ``make verify`` computes again: the same cell with few
             iterations, updates or doors. ``None`` for a cell of which another one has the slice.

@@ -292,9 +292,9 @@ def rows_of_learning() -> Iterator[Row]:
     one = {"players": [grid.start(generators)], "run": 0}
     yield row(of_run, one, players=LIST, run=NATURAL + bad("range", len(generators)))
 
-    yield row(
-        rollouts.RewardNormalizer, {"num_runs": 2, "num_copies": 3, "discount": 0.9, "clip": 10.0}
-    )
+    scales = LIST + bad("range", [0, 4])
+    good = {"num_runs": 2, "scales": [3], "discount": 0.9, "clip": 10.0}
+    yield row(rollouts.RewardNormalizer, good, scales=scales)
     make = functools.partial(gymnasium.make, "CartPole-v1")
     envs = SyncVectorEnv([make] * 4, autoreset_mode=AutoresetMode.SAME_STEP)
     others = SyncVectorEnv([make] * 4)
@@ -309,6 +309,7 @@ def rows_of_learning() -> Iterator[Row]:
     yield row(
         rollouts.Collector,
         {"environments": environments, "num_steps": 2, "discount": 0.9, "gae_lambda": 0.9},
+        scales=scales,
     )
     copies = COUNT + bad("range", (), (0, 4), (4, 2.0))
     yield row(ppo.PPOSettings, {"method": "ipo"}, num_envs=copies)
@@ -316,7 +317,8 @@ def rows_of_learning() -> Iterator[Row]:
     for function in (settings.moves, settings.copies):
         yield row(function, {"num_domains": 2})
     yield row(settings.size_of_minibatches, {"num_frames": 8})
-    yield row(settings.collector, {"environments": environments})
+    copies = LIST + bad("range", [0, 4])
+    yield row(settings.collector, {"environments": environments, "copies": [4]}, copies=copies)
     starts = [dense.start(generators)]
     yield row(
         NetworkPlayers,

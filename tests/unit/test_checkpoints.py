@@ -155,6 +155,9 @@ def test_a_training_is_kept_until_its_rows_are_saved(tmp_path, monkeypatch):
     assert len(rows) == len(expected)
     assert sorted(rows["value"]) == pytest.approx(sorted(expected["value"]), rel=1e-8)
     assert list(places.checkpoints.iterdir()) == []
+    (batch,) = store.batches()
+    of_training = expected.loc[expected["metric"] == "cpu_seconds", "value"].max()
+    assert batch["cpu_seconds"] >= of_training - 0.01, "what it had cost before is left out"
 
 
 def test_a_shorter_training_is_the_beginning_of_a_longer_one(tmp_path):

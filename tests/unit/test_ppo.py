@@ -765,6 +765,7 @@ def test_published_settings_are_the_papers():
         "discount": 0.99,
         "gae_lambda": 0.95,
         "normalize_rewards": False,
+        "reward_scale": "player",
         "normalize_advantages": "none",
         "time_outs": "terminal",
         "skip_last_frames": True,

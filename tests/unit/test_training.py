@@ -118,15 +118,39 @@ def test_rewards_are_normalised_as_step_by_step_and_piece_by_piece():
     expected = np.stack(
         [slow_normalizer(r, e, 0.9, 1.5) for r, e in zip(rewards, ended, strict=True)]
     )
-    whole = RewardNormalizer(2, 3, 0.9, 1.5)(torch.tensor(rewards), torch.tensor(ended))
+    whole = RewardNormalizer(2, [3], 0.9, 1.5)(torch.tensor(rewards), torch.tensor(ended))
     np.testing.assert_allclose(whole, expected)
     assert np.abs(expected).max() == 1.5, "nothing was clipped: the test is too weak"
-    pieces = RewardNormalizer(2, 3, 0.9, 1.5)
+    pieces = RewardNormalizer(2, [3], 0.9, 1.5)
     parts = [
         pieces(torch.tensor(r), torch.tensor(e))
         for r, e in zip(np.split(rewards, 4, -1), np.split(ended, 4, -1), strict=True)
     ]
     np.testing.assert_allclose(torch.cat(parts, -1), expected)
+
+
+def test_rewards_of_a_domain_can_have_a_scale_of_their_own():
+    """The rewards of the third copy are a hundred times as large."""
+    random = np.random.default_rng(0)
+    rewards, ended = random.normal(3, 2, (1, 3, 40)), random.random((1, 3, 40)) < 0.1
+    rewards[:, 2] *= 100
+
+    def normalised(reward_scale):
+        changes = {"num_envs": (2, 1), "normalize_rewards": True, "reward_scale": reward_scale}
+        settings = PPOSettings("ppo", **(SMALL | changes))
+        (collector,) = trainings(settings, [0]).collectors
+        return collector.normalizer(torch.tensor(rewards), torch.tensor(ended))[0].numpy()
+
+    parts = [slow_normalizer(rewards[0, own], ended[0, own], 0.99, 10) for own in ([0, 1], [2])]
+    np.testing.assert_allclose(normalised("domain"), np.concatenate(parts))
+    whole = slow_normalizer(rewards[0], ended[0], 0.99, 10)
+    np.testing.assert_allclose(normalised("player"), whole)
+    assert np.abs(whole[:2]).max() < 0.1 * np.abs(parts[0]).max()
+
+
+def test_scales_are_those_of_all_copies():
+    with pytest.raises(ValueError, match=r"scales = \[2, 2\]: must be 3 copies in all"):
+        Collector(Counting(1, 3), 4, 0.9, 0.9, reward_clip=10.0, scales=[2, 2])
 
 
 # -------------------------------------------------------------------------- copies of domains
@@ -182,7 +206,11 @@ def flat(training: Training) -> Tensor:
 
 @pytest.mark.parametrize(
     ("method", "more"),
-    [*((method, {}) for method in METHODS), ("ipo", {"variable_phi": True})],
+    [
+        *((method, {}) for method in METHODS),
+        ("ppo", {"reward_scale": "domain"}),
+        ("ipo", {"variable_phi": True}),
+    ],
 )
 def test_a_restored_training_goes_on_as_if_nothing_had_happened(method, more):
     changes = {"normalize_rewards": True, "normalize_advantages": "rollout", "num_steps": 18}

@@ -169,6 +169,7 @@ def train_run(
         ValueError: policies of other settings are where these would be saved.
     """
     runs = Runs(cell, seeds, Path(checkpoints), Path(policies))
+    earlier = runs.cpu_seconds * len(seeds)
     bar = tqdm(
         total=cell.settings.num_updates,
         initial=runs.num_updates,
@@ -181,7 +182,9 @@ def train_run(
         while runs.num_updates < cell.settings.num_updates:
             runs.update()
             bar.update()
-    return runs.rows()
+    rows = runs.rows()
+    rows.attrs["earlier_cpu_seconds"] = earlier
+    return rows
 
 
 class Runs:
