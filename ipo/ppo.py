@@ -37,7 +37,7 @@ METHODS = ("ppo", "ipo", "ensemble", "in_turn")
 NORMALIZATIONS = ("none", "minibatch", "rollout")
 SCALES = ("player", "domain")
 
-Copies = Annotated[Sequence[Count], "domains"]  # how many of each domain
+NumCopies = Annotated[Sequence[Count], "domains"]  # how many of each domain
 # (domains, how many copies of each, a generator for each run) -> environments
 MakeEnvironments = Callable[[list[int], list[int], Generators], Environments]
 
@@ -154,7 +154,7 @@ class PPOSettings:
 
     @checked
     def collector(
-        self, environments: Environments, copies: Copies, device: Device = "cpu"
+        self, environments: Environments, copies: NumCopies, device: Device = "cpu"
     ) -> Collector:
         """Of a player in its environments, so many copies of each of its domains."""
         clip = self.reward_clip if self.normalize_rewards else None

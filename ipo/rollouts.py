@@ -133,6 +133,9 @@ class Collector:
         reward_clip: bound on normalised rewards; ``None``: they are not normalised.
         scales: see :class:`RewardNormalizer`; ``None``: all copies share a deviation.
         device: of the policy and the rollouts; environments and their answers are on the CPU.
+
+    Raises:
+        ValueError: ``scales`` that are not those of all copies.
     """
 
     environments: Environments
