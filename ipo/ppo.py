@@ -62,7 +62,8 @@ class PPOSettings:
         num_epochs: passes over a rollout.
         minibatch_size: frames of each gradient step.
         num_minibatches: of an epoch; instead of their size, where it is given.
-        clip: bound on the change of an action's probability ratio, and of the value.
+        clip: bound on the change of an action's probability ratio.
+        clip_values: whether it bounds the change of the value, too; the published runs did.
         value_weight, entropy_weight: of their terms in the loss.
         max_gradient_norm: bound on the norm of a player's gradient.
         discount, gae_lambda: gamma, and lambda of the advantage estimate.
@@ -93,6 +94,7 @@ class PPOSettings:
     minibatch_size: Count = 256
     num_minibatches: Count | None = None
     clip: Positive = 0.2
+    clip_values: bool = True
     value_weight: NonNegative = 0.5
     entropy_weight: NonNegative = 0.01
     max_gradient_norm: Positive = 0.5
@@ -357,18 +359,19 @@ def loss_gradient(
         - (1/B) [rho A grad log pi(a | o) + w_e grad H(pi)],        (2 w_v / B) (V - G)
 
     without rho A and V - G where the minimum and the maximum are those of the clipped numbers,
-    which are constant.
+    which are constant. Without ``clip_values`` the value's part is that of (V - G)^2.
     """
     gain, near_gain = gains(distribution, parameters, batch, settings)
-    near = values.clamp(batch.values - settings.clip, batch.values + settings.clip)
-    error, near_error = values - batch.returns, near - batch.returns
+    error = values - batch.returns
+    if settings.clip_values:
+        near = values.clamp(batch.values - settings.clip, batch.values + settings.clip)
+        error = error.masked_fill((near - batch.returns) ** 2 > error**2, 0.0)
     share = 1 / values.shape[1]
     weights = -share * gain.masked_fill(near_gain < gain, 0.0)
     of_parameters = distribution.gradient(
         parameters, batch.actions, weights, -share * settings.entropy_weight
     )
-    of_values = error.masked_fill(near_error**2 > error**2, 0.0)
-    return of_parameters, 2 * share * settings.value_weight * of_values
+    return of_parameters, 2 * share * settings.value_weight * error
 
 
 def gains(

@@ -180,7 +180,9 @@ def loss(players, frames, s):
     ratio = torch.exp(policy.log_prob(frames["actions"]) - frames["log_probabilities"])
     clipped_ratio = torch.clamp(ratio, 1 - s.clip, 1 + s.clip)
     policy_loss = -torch.min(ratio * gains, clipped_ratio * gains).mean()
-    clipped_values = old_values + torch.clamp(values - old_values, -s.clip, s.clip)
+    clipped_values = values
+    if s.clip_values:
+        clipped_values = old_values + torch.clamp(values - old_values, -s.clip, s.clip)
     value_loss = torch.max((values - returns) ** 2, (clipped_values - returns) ** 2).mean()
     entropy = policy.entropy().mean()
     if "factors" in frames:

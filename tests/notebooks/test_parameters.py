@@ -3,7 +3,7 @@
 import re
 
 import pytest
-from by_hand import NAMES, begin, defaults
+from by_hand import NAMES, SMOKE, begin, defaults
 
 # By the type of the default; None stands for what may be left out.
 BAD = {
@@ -44,6 +44,19 @@ def test_training_colours_that_cannot_be(colors, rule):
         (TypeError, ValueError), match=rf"^train_colors.* = .*must .*{re.escape(rule)}"
     ):
         begin("keys", train_colors=colors)
+
+
+@pytest.mark.parametrize(
+    ("more", "fewer"),
+    [
+        ("num_runs_variants", "num_runs"),
+        ("num_runs_regularized", "num_runs"),
+        ("num_runs_live", "num_runs_curves"),
+    ],
+)
+def test_runs_of_keys_that_nothing_stands_beside_are_refused(more, fewer):
+    with pytest.raises(ValueError, match=rf"^{more} = 7: must be at most {fewer} = 6$"):
+        begin("keys", **SMOKE["keys"] | {fewer: 6, more: 7})
 
 
 @pytest.mark.parametrize("name", sorted({name for name, *_ in CASES}))

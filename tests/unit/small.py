@@ -134,10 +134,12 @@ def clipped_loss(
         + w_v mean max((V - G)^2, (clip(V, V_old - c, V_old + c) - G)^2),
         rho = pi(a | o) / pi_old(a | o)
 
-    G are the returns of the rollout.
+    G are the returns of the rollout; without ``clip_values`` V is not clipped.
     """
     gain, near_gain = gains(distribution, parameters, batch, settings)
-    near = values.clamp(batch.values - settings.clip, batch.values + settings.clip)
+    near = values
+    if settings.clip_values:
+        near = values.clamp(batch.values - settings.clip, batch.values + settings.clip)
     error, near_error = values - batch.returns, near - batch.returns
     return (
         -torch.minimum(gain, near_gain).mean(1)

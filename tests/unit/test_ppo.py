@@ -135,6 +135,7 @@ ARMS = {
         2,
         {
             "clip": 0.05,
+            "clip_values": False,
             "value_weight": 2.0,
             "entropy_weight": 0.1,
             "max_gradient_norm": 0.1,
@@ -535,7 +536,7 @@ def slow_loss(logits, values, batch: Rollout, s: PPOSettings, run: int) -> float
         surprise = -sum(p * math.log(p) for p in probabilities)
         old, new = float(batch.values[run, i]), float(values[run, i])
         target = float(batch.returns[run, i])
-        near_value = old + min(max(new - old, -s.clip), s.clip)
+        near_value = old + min(max(new - old, -s.clip), s.clip) if s.clip_values else new
         error = max((new - target) ** 2, (near_value - target) ** 2)
         policy_loss = -min(ratio * gains[i], near * gains[i])
         total += policy_loss - s.entropy_weight * surprise + s.value_weight * error
@@ -547,12 +548,14 @@ def slow_loss(logits, values, batch: Rollout, s: PPOSettings, run: int) -> float
     clip=st.floats(0.01, 1),
     entropy_weight=st.floats(0, 1),
     value_weight=st.floats(0, 1),
+    clip_values=st.booleans(),
     normalize=st.sampled_from(["none", "minibatch"]),
 )
-def test_loss_is_that_by_hand(seed, clip, entropy_weight, value_weight, normalize):
+def test_loss_is_that_by_hand(seed, clip, entropy_weight, value_weight, clip_values, normalize):
     settings = PPOSettings(
         "ppo",
         clip=clip,
+        clip_values=clip_values,
         entropy_weight=entropy_weight,
         value_weight=value_weight,
         normalize_advantages=normalize,
@@ -624,8 +627,9 @@ def test_gradient_is_zero_where_the_ratio_is_clipped():
 
 @pytest.mark.parametrize("distribution", [Categorical, Gaussian])
 @pytest.mark.parametrize("dtype, rtol", [(torch.float64, 1e-12), (torch.float32, 1e-5)])
+@pytest.mark.parametrize("clip_values", [True, False])
 @pytest.mark.parametrize("normalize", ["none", "minibatch"])
-def test_gradient_of_the_loss_is_that_of_torch(distribution, dtype, rtol, normalize):
+def test_gradient_of_the_loss_is_that_of_torch(distribution, dtype, rtol, clip_values, normalize):
     """On frames of which many are clipped, in the ratio, in the value, in both and in neither."""
     generator = torch.Generator().manual_seed(0)
 
@@ -640,7 +644,7 @@ def test_gradient_of_the_loss_is_that_of_torch(distribution, dtype, rtol, normal
         parameters[..., 3:].exp_()
     old = distribution.log_probability(parameters, actions) + 0.3 * normal()
     batch = Rollout(values, actions, old, values + 0.3 * normal(), normal(), normal())
-    settings = PPOSettings("ppo", normalize_advantages=normalize)
+    settings = PPOSettings("ppo", clip_values=clip_values, normalize_advantages=normalize)
     leaves = [x.clone().requires_grad_() for x in (parameters, values)]
     loss = clipped_loss(distribution, *leaves, batch, settings)
     expected = torch.autograd.grad(loss.sum(), leaves)
@@ -648,7 +652,7 @@ def test_gradient_of_the_loss_is_that_of_torch(distribution, dtype, rtol, normal
     for ours, theirs in zip(found, expected, strict=True):
         constant = ours == 0  # where the entropy has no say: in the values
         assert_close(ours, theirs, rtol)
-    assert 0.1 < constant.double().mean() < 0.9
+    assert 0.1 < constant.double().mean() < 0.9 if clip_values else not constant.any()
 
 
 @pytest.mark.parametrize("max_norm", [0.1, 0.5, 1000.0])
@@ -758,6 +762,7 @@ def test_published_settings_are_the_papers():
         "minibatch_size": 256,
         "num_minibatches": None,
         "clip": 0.2,
+        "clip_values": True,
         "value_weight": 0.5,
         "entropy_weight": 0.01,
         "max_gradient_norm": 0.5,
