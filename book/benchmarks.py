@@ -10,9 +10,11 @@ RECORD = DATA / "bench" / "own_domains.json"
 
 def overview() -> str:
     record = read_record(RECORD)
-    lines = ["| Environment | | Frames per CPU second | Return |", "|:--|:--|--:|--:|"]
+    heads = ["Environment", "", "Frames", "Frames per CPU second", "Return"]
+    lines = [f"| {' | '.join(heads)} |", "|:--|:--|--:|--:|--:|"]
     for row in record["rows"]:
-        speed, value = f"{row['frames_per_cpu_second']:,.0f}", f"{row['return']:,.0f}"
-        lines.append(f"| {row['environment']} | {row['arm']} | {speed} | {value} |")
-    title = f"After {record['frames']:,} frames; means of {record['num_seeds']} seeds:"
+        frames, speed = f"{row['frames']:,}", f"{row['frames_per_cpu_second']:,.0f}"
+        value = f"{row['return']:,.{2 if abs(row['return']) < 1 else 0}f}"
+        lines.append(f"| {row['environment']} | {row['arm']} | {frames} | {speed} | {value} |")
+    title = f"Means of {record['num_seeds']} seeds, after as many frames as stand there:"
     return "\n".join([title, "", *lines, ""])

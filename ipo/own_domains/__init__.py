@@ -50,7 +50,7 @@ one_thread = threadpool_limits.wrap(limits=1)
 def default_settings(method: str, num_domains: int, **changes: Any) -> PPOSettings:
     """Settings that are sensible for classic control; the learning rates are the paper's.
 
-    The value's change is not bounded: on Acrobot and Hopper a policy learns better without.
+    The change of the value is not bounded: on Acrobot a policy learns far better without.
     The copies of environments, about thirty, can be split evenly among domains and players by
     every method, so that all of them see the same number of frames.
     """
