@@ -88,8 +88,8 @@ class RewardNormalizer:
         self.moments = torch.stack([count, mean, square])[..., -1]
         variance = (square / count - (mean / count).square()).clamp(min=0)
         deviation = (variance + 1e-8).sqrt().to(rewards)
-        of_copies = torch.tensor(self.scales, device=rewards.device)
-        scaled = rewards / deviation.repeat_interleave(of_copies, dim=1)
+        of_copies = torch.arange(len(self.scales)).repeat_interleave(torch.tensor(self.scales))
+        scaled = rewards / deviation.index_select(1, of_copies.to(rewards.device))
         return scaled.clamp(-self.clip, self.clip)
 
 
