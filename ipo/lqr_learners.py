@@ -34,7 +34,7 @@ from ipo.lqr import (
     split_domains,
     training_costs,
 )
-from ipo.optimizers import OPTIMIZERS, Slope, descend, make_optimizer, step
+from ipo.optimizers import OPTIMIZERS, Slope, make_optimizer, step
 
 LQR_METHODS = ("gradient_descent", "overparameterized", "ipo_fixed_phi", "ipo_variable_phi")
 LQR_CONTROLS = ("in_turn", "ensemble")
@@ -151,12 +151,16 @@ def overparameterized(
     Phi, K = _random_layers(problem, settings, seeds)
     optimizer, cost = _optimizer(settings, [Phi, K]), PooledCost(problem, problem.seen)
 
+    def slope_in_layers() -> Slope:
+        costs, (of_gain,) = cost.slope(K @ Phi)
+        return costs, [K.mT @ of_gain, of_gain @ Phi.mT]
+
     def respond(_: int) -> None:
-        descend(optimizer, lambda: cost(K @ Phi), settings.max_gradient_norm)
+        step(optimizer, slope_in_layers(), slope_in_layers, settings.max_gradient_norm)
 
     return Learner(
         iterate=lambda: play_round(1, respond),
-        gain=lambda: (K @ Phi).detach(),
+        gain=lambda: K @ Phi,
     )
 
 
@@ -179,7 +183,6 @@ def ipo_variable_phi(
 ) -> Learner:
     """Phi moves on the pooled cost of all domains, then every player on its own, above Phi."""
     Phi, K = _random_layers(problem, settings, seeds)
-    Phi = Phi.detach()
     players = _players(settings, K, problem.num_domains)
     optimizer = _optimizer(settings, [Phi])
     pooled = PooledCost(problem, problem.seen)
@@ -324,7 +327,7 @@ def _random_layers(
         )
 
     layers = zip(*map(draw, seeds), strict=True)
-    Phi, K = (torch.tensor(np.stack(layer)).to(problem.A).requires_grad_() for layer in layers)
+    Phi, K = (torch.tensor(np.stack(layer)).to(problem.A) for layer in layers)
     return Phi, K
 
 
