@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from experiments import figures
-from experiments.experiment import Experiment, a_fiftieth_earlier
+from experiments.experiment import Experiment, near_the_end
 from experiments.rows import tidy
 from experiments.store import select
 from ipo.causality.icp import icp
@@ -349,7 +349,7 @@ def short(cell: Cell) -> Cell | None:
 
 
 EXPERIMENTS = {
-    name: Experiment(run_cell, Cell, short, earlier=a_fiftieth_earlier)
+    name: Experiment(run_cell, Cell, short, near_the_end=near_the_end)
     for name in ("linear", "digits", "failures")
 }
 

@@ -22,7 +22,7 @@ import argparse
 import datetime
 import json
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -137,30 +137,38 @@ def alike(shipped: pd.DataFrame, columns: dict[str, Any], both: pd.DataFrame) ->
     return bool((outside.groupby([beside["domain"], beside["metric"]]).mean() <= 0.5).all())
 
 
-def unsettled(both: pd.DataFrame, before: pd.DataFrame) -> bool:
+def unsettled(both: pd.DataFrame, moments: Iterable[pd.DataFrame]) -> bool:
     """Whether rows differ from the shipped ones by no more than where a training was stopped.
 
     Of each metric and domain runs are on average at most UNREST times as far from what is shipped
-    as from what they were ``before`` the end, and by a paired t-test they are to neither side of
-    it; a single run has no side. So it is never true of a training that is at rest.
+    as they were, at the most, from their own end at some ``moments`` before it; and by a paired
+    t-test they are to neither side of what is shipped. A single run has no side. So it is never
+    true of a training that is at rest. Only as many moments are looked at as it takes.
     """
-    keys = [column for column in before.columns if column not in ("value", "round")]
-    three = both.merge(before.rename(columns={"value": "value_before"}), on=keys)
-    three["apart"] = three["value_now"] - three["value"]
-    three["moved"] = three["value_now"] - three["value_before"]
-    groups = [own for _, own in three.groupby(["domain", "metric"])]
-    sided = [own["apart"] for own in groups if own["apart"].any() and len(own) > 1]
-    p = [scipy.stats.ttest_1samp(apart, 0).pvalue for apart in sided]
-    near = [own["apart"].abs().mean() <= UNREST * own["moved"].abs().mean() for own in groups]
-    return all(near) and min(p, default=1.0) > LEVEL / len(groups)
+    both = both.reset_index(drop=True)
+    apart, kinds = both["value_now"] - both["value"], [both["domain"], both["metric"]]
+    moved = pd.Series(0.0, both.index)
+    for rows in moments:
+        keys = [column for column in rows.columns if column not in ("value", "round")]
+        before = both[keys].merge(rows, on=keys, how="left")["value"]
+        moved = moved.combine((both["value_now"] - before).abs(), max)
+        if (apart.abs().groupby(kinds).mean() <= UNREST * moved.groupby(kinds).mean()).all():
+            return not _sided([own for _, own in apart.groupby(kinds)])
+    return False
 
 
-def elsewhere(part: Slice, rows: pd.DataFrame) -> pd.DataFrame | None:
+def _sided(groups: Sequence[pd.Series]) -> bool:
+    """Whether differences are to one side in some group of them."""
+    runs = [own for own in groups if own.any() and len(own) > 1]
+    return any(scipy.stats.ttest_1samp(own, 0).pvalue <= LEVEL / len(groups) for own in runs)
+
+
+def elsewhere(experiment: str, recorded: pd.DataFrame, rows: pd.DataFrame) -> pd.DataFrame | None:
     """The record and ``rows`` in those domains and metrics where some run is not close to it."""
-    both = side_by_side(Store(DATA / "results" / part.chapter, part.name).rows_of(part.batch), rows)
+    both = side_by_side(recorded, rows)
     if both is None:
         return None
-    away = ~within(both, f"{part.chapter}/{part.name}", LONGER)
+    away = ~within(both, experiment, LONGER)
     return both[away.groupby([both["domain"], both["metric"]]).transform("any")]
 
 
@@ -180,8 +188,9 @@ def _outcome(part: Slice, scratch: Path) -> tuple[str, dict[str, Any]]:
     rows = part.run(scratch)
     how, apart = compared(part, rows), {}
     if how == "differs":
-        away = elsewhere(part, rows)
-        if away is not None and _is_unsettled(part, away, scratch):
+        recorded = Store(DATA / "results" / part.chapter, part.name).rows_of(part.batch)
+        away = elsewhere(f"{part.chapter}/{part.name}", recorded, rows)
+        if away is not None and unsettled(away, part.run_near_the_end(scratch)):
             how = "unsettled"
         else:
             apart = {"apart": how_far(away)}
@@ -194,11 +203,6 @@ def _outcome(part: Slice, scratch: Path) -> tuple[str, dict[str, Any]]:
         "machine": origin.machine(),
         "packages": ", ".join(f"{name} {number}" for name, number in origin.versions().items()),
     }
-
-
-def _is_unsettled(part: Slice, away: pd.DataFrame, scratch: Path) -> bool:
-    before = part.run_earlier(scratch)
-    return before is not None and unsettled(away, before)
 
 
 def _is_done(done: dict[str, dict[str, Any]], name: str, since: str | None) -> bool:

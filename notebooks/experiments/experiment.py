@@ -69,9 +69,9 @@ class Experiment:
         checkpoints: ``checkpoints(cell)`` are the files that carry work, by the runs that were
             begun together and go on together. It is not the run that removes them but the store,
             when the rows are saved and read back. ``None``: nothing is kept on the way.
-        earlier: ``earlier(cell)`` is the cell a little before the end of its training, or None if
-            it is not trained: what moves until then is not at rest, and ``make confirm`` cannot
-            ask for the same digits. ``None``: all cells come to rest.
+        near_the_end: ``near_the_end(cell)`` are the cell at a few moments before the end of its
+            training, and none if it is not trained: what moves until then is not at rest, and
+            nobody can ask for the same digits on another machine. ``None``: all cells come to rest.
     """
 
     run: Callable[..., pd.DataFrame]
@@ -82,7 +82,7 @@ class Experiment:
     runs_at_once: Count | None = None
     divisible: bool = False
     checkpoints: Callable[..., dict[tuple[int, ...], list[Path]]] | None = None
-    earlier: Callable[[Any], Any | None] | None = None
+    near_the_end: Callable[[Any], list[Any]] | None = None
 
     def at(self, places: Places) -> Experiment:
         """The same, where the run function knows its folders."""
@@ -91,14 +91,18 @@ class Experiment:
         return dataclasses.replace(self, **bound)
 
 
-def a_fiftieth_earlier(cell: Any) -> Any | None:
-    """Without the last fiftieth of the iterations, as Adam at a constant rate keeps moving."""
+def near_the_end(cell: Any, steps: str = "num_iterations") -> list[Any]:
+    """A cell at four moments of the last fiftieth of the ``steps`` that its settings count."""
     if cell.settings is None:
-        return None
-    num_iterations = cell.settings.num_iterations * 49 // 50
-    return dataclasses.replace(
-        cell, settings=dataclasses.replace(cell.settings, num_iterations=num_iterations)
-    )
+        return []
+    return [dataclasses.replace(cell, settings=own) for own in with_fewer(cell.settings, steps)]
+
+
+def with_fewer(settings: Any, steps: str) -> list[Any]:
+    """Settings that end at four moments of the last fiftieth of their ``steps``."""
+    number = getattr(settings, steps)
+    left = [round(number * part / 50) for part in (1, 1 / 2, 3 / 4, 1 / 4)]
+    return [dataclasses.replace(settings, **{steps: number - n}) for n in left]
 
 
 def rebuilt(kind: Any, value: Any) -> Any:

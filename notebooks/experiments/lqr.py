@@ -11,7 +11,7 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from experiments.experiment import Experiment, a_fiftieth_earlier
+from experiments.experiment import Experiment, near_the_end
 from experiments.figures import label
 from experiments.rows import tidy
 from experiments.store import select
@@ -340,7 +340,7 @@ def short_if_small(cell: Cell) -> Cell | None:
 
 
 EXPERIMENTS = {
-    name: Experiment(run_cell, Cell, short_if_small, earlier=a_fiftieth_earlier)
+    name: Experiment(run_cell, Cell, short_if_small, near_the_end=near_the_end)
     for name in (
         "tables",
         "starts",

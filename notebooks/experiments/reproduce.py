@@ -9,6 +9,7 @@ every cell are held beside the shipped ones:
 
 - ``exact`` and ``close``: as ``experiments.confirm`` says;
 - ``alike``: where networks are trained, which is chaotic, other runs of the same cell;
+- ``unsettled``: as there; the runs of such a cell are trained once more, to moments before the end;
 - ``differs`` otherwise, and the command fails.
 """
 
@@ -19,12 +20,14 @@ import heapq
 import sys
 from collections.abc import Iterable, Sequence
 from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import pandas as pd
 import scipy.stats
 from tqdm import tqdm
 
-from experiments.confirm import CHAOTIC, LEVEL, agreement
+from experiments.confirm import CHAOTIC, LEVEL, agreement, elsewhere, unsettled
 from experiments.experiment import Cell, Experiment, Places, rebuilt
 from experiments.registry import CHAPTERS, DATA, chosen
 from experiments.store import Batch, Store, select, timed, together
@@ -33,7 +36,7 @@ from experiments.work import finished, num_at_once
 from ipo.checks import check_choice
 
 BAR = "{desc}: {percentage:.1f} % of the time{postfix}; {elapsed} gone, {remaining} left"
-OUTCOMES = ("exact", "close", "alike", "differs")
+OUTCOMES = ("exact", "close", "alike", "unsettled", "differs")
 FEWEST = 10  # runs of which a test of ranks can have a p-value as small as is asked for
 
 
@@ -58,7 +61,7 @@ def reproduce(
     with tqdm(**options, desc="reproduced", smoothing=0, miniters=1) as bar:
         for wave in waves:
             compute(wave, bar, num_workers, scheduler)
-    return comparison(chapters)
+    return comparison(chapters, num_workers, scheduler)
 
 
 def recorded(chapters: Sequence[str], at_once: int | None = None) -> list[list[Slice]]:
@@ -169,19 +172,38 @@ def wall_seconds(waves: Iterable[Iterable[float]], num_workers: int) -> float:
 # ------------------------------------------------------------------ beside what is shipped
 
 
-def comparison(chapters: Sequence[str]) -> pd.DataFrame:
+def comparison(
+    chapters: Sequence[str], num_workers: int = -1, scheduler: str | None = None
+) -> pd.DataFrame:
     """A row for every experiment: its cells, and how many of them came out how."""
-    lines = []
+    cells = pd.DataFrame(outcomes(chapters, num_workers, scheduler), columns=["experiment", "how"])
+    counts = pd.crosstab(cells["experiment"], cells["how"]).reindex(columns=OUTCOMES, fill_value=0)
+    counts.insert(0, "cells", counts.sum(axis=1))
+    return counts.rename_axis(columns=None).reset_index()
+
+
+def outcomes(
+    chapters: Sequence[str], num_workers: int, scheduler: str | None
+) -> list[tuple[str, str]]:
+    """The experiment of every cell, and how all runs of it compare with the shipped ones."""
+    found, jobs = [], []
     for chapter, name in chosen(chapters):
+        experiment = f"{chapter}/{name}"
         shipped = Store(DATA / "results" / chapter, name)
-        if not shipped.batches():
-            continue
-        old, new = shipped.rows(), Store(DATA / "reproduced" / chapter, name).rows()
-        cells = {str(b["columns"]): b["columns"] for b in shipped.batches()}.values()
-        found = [outcome(chapter, name, select(old, c), select(new, c)) for c in cells]
-        counts = {how: found.count(how) for how in OUTCOMES}
-        lines.append({"experiment": f"{chapter}/{name}", "cells": len(found), **counts})
-    return pd.DataFrame(lines, columns=["experiment", "cells", *OUTCOMES])
+        batches = {str(batch["columns"]): batch for batch in shipped.batches()}.values()
+        every = (shipped.rows(), Store(DATA / "reproduced" / chapter, name).rows())
+        for batch in batches:
+            old, new = (select(rows, batch["columns"]) for rows in every)
+            how = outcome(chapter, name, old, new)
+            moving = how == "differs" and CHAPTERS[chapter][name].near_the_end is not None
+            if moving and (away := elsewhere(experiment, old, new)) is not None:
+                part = Slice(chapter, name, batch | {"seeds": sorted(set(old["run"].tolist()))})
+                jobs.append(partial(_unsettled, part, away))
+            else:
+                found.append((experiment, how))
+    work = finished(jobs, num_workers, scheduler)
+    bar = tqdm(work, desc="trained again", total=len(jobs), unit="cell", disable=not jobs)
+    return found + list(bar)
 
 
 def outcome(chapter: str, name: str, shipped: pd.DataFrame, again: pd.DataFrame) -> str:
@@ -189,6 +211,12 @@ def outcome(chapter: str, name: str, shipped: pd.DataFrame, again: pd.DataFrame)
     trained = f"{chapter}/{name}" in CHAOTIC or CHAPTERS[chapter][name].reads is not None
     how = agreement(f"{chapter}/{name}", shipped, again)
     return how or ("alike" if trained and alike(shipped, again) else "differs")
+
+
+def _unsettled(part: Slice, away: pd.DataFrame) -> tuple[str, str]:
+    with TemporaryDirectory() as scratch:
+        moves = unsettled(away, part.run_near_the_end(Path(scratch)))
+    return f"{part.chapter}/{part.name}", "unsettled" if moves else "differs"
 
 
 def alike(shipped: pd.DataFrame, again: pd.DataFrame) -> bool:

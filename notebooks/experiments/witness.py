@@ -71,11 +71,11 @@ class Slice:
         experiment, cell = self._experiment(scratch)
         return timed(experiment.run, cell, self.batch["seeds"])[1]
 
-    def run_earlier(self, scratch: Path) -> pd.DataFrame | None:
-        """The rows a little before the end of a training; None: it has no such cell."""
+    def run_near_the_end(self, scratch: Path) -> Iterator[pd.DataFrame]:
+        """The rows at a few moments before the end of a training."""
         experiment, cell = self._experiment(scratch)
-        before = experiment.earlier(cell) if experiment.earlier else None
-        return timed(experiment.run, before, self.batch["seeds"])[1] if before else None
+        for before in experiment.near_the_end(cell) if experiment.near_the_end else ():
+            yield timed(experiment.run, before, self.batch["seeds"])[1]
 
     def _experiment(self, scratch: Path) -> tuple[Experiment, Cell]:
         experiment = again(self.chapter, self.name, scratch)

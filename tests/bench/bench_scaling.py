@@ -43,7 +43,7 @@ WHOLE = {
     "door/curves": (replace(DOOR, settings=ONE_UPDATE), EXPERIMENT.runs_at_once),
 }
 SWEEP = WHOLE | {"door/curves": (replace(DOOR, settings=shorter(ONE_UPDATE)), 1)}
-NUM_OF_EACH = 2
+NUM_OF_EACH = 6  # so that little time passes in which one worker has nothing left to do
 
 
 def seconds(name: str, cell: Cell, num_runs: int, folder: Path) -> float:

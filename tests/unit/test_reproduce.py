@@ -1,6 +1,7 @@
 """Everything from nothing, on a toy whose second experiment reads what the first one saves."""
 
 import sys
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -84,6 +85,23 @@ def test_another_training_shows_in_its_rows_and_in_what_reads_them(toy, monkeypa
     monkeypatch.setitem(STATE, "shift", shift)
     found = reproduce.reproduce(num_workers=1)
     assert outcomes(found) == {"lqr/played": played, "lqr/trained": played}
+
+
+@pytest.mark.parametrize(("moves", "how"), [(0.0, "differs"), (2.0, "unsettled")])
+def test_what_never_comes_to_rest_may_end_elsewhere(toy, monkeypatch, moves, how):
+    def elsewhere(cell: Cell, seeds: list[int]) -> pd.DataFrame:
+        """Runs one up and one down, and up and down again before the end."""
+        rows = toy_experiment.run(cell, seeds)
+        side = 1.0 - 2.0 * (rows["run"] % 2)
+        return rows.assign(value=rows["value"] + side * (1 + moves * (cell.power == 0.25)))
+
+    def before(cell: Cell) -> list[Cell]:
+        return [replace(cell, power=0.25)]
+
+    experiments = {"trained": Experiment(elsewhere, Cell, near_the_end=before)}
+    for module in (registry, reproduce):
+        monkeypatch.setattr(module, "CHAPTERS", {"lqr": experiments})
+    assert outcomes(reproduce.reproduce(num_workers=1)) == {"lqr/trained": {how: 2}}
 
 
 def test_cells_that_differ_are_an_error(toy, monkeypatch):

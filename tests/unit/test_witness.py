@@ -2,6 +2,7 @@
 
 import runpy
 import shutil
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -141,7 +142,21 @@ def ends(phase: float, shift: float = 0.0, size: float = 1.0) -> pd.DataFrame:
 )
 def test_where_an_unsettled_training_may_end(now, before, expected):
     both = witness.side_by_side(ends(0.0), now)
-    assert confirm.unsettled(both, before) == expected
+    assert confirm.unsettled(both, [before]) == expected
+
+
+def test_moments_before_the_end_count_by_the_furthest():
+    """Whoever goes round may stand where it stood before, at one moment but not at all."""
+    both = witness.side_by_side(ends(0.0), ends(1.0))
+    assert not confirm.unsettled(both, [ends(1.0), ends(1.1)])
+    assert confirm.unsettled(both, [ends(1.0), ends(2.0)])
+    assert not confirm.unsettled(both, [])  # it is not trained
+
+    def one_is_enough() -> Iterator[pd.DataFrame]:
+        yield ends(2.0)
+        raise AssertionError("looked at a moment that is not needed")
+
+    assert confirm.unsettled(both, one_is_enough())
 
 
 @pytest.mark.parametrize(("moved", "expected"), [(0.6, True), (0.4, False)])
@@ -152,15 +167,16 @@ def test_a_single_run_may_be_elsewhere_by_twice_what_it_moves(moved, expected):
         )
 
     both = witness.side_by_side(alone(100, 5.0), alone(100, 6.0))
-    assert confirm.unsettled(both, alone(98, 6.0 - moved)) == expected
+    assert confirm.unsettled(both, [alone(98, 6.0 - moved)]) == expected
 
 
 def test_only_the_end_of_a_game_may_be_elsewhere():
     parts = confirm.full_batches(["algorithm/averages"])
     cells = [rebuilt(played.Trajectory, part.batch["cell"]) for part in parts]
-    before = {cell.on_the_way: played.earlier(cell) for cell in cells}
-    assert before[True] is None
-    assert before[False].game.settings.num_rounds == 1470
+    before = {cell.on_the_way: played.near_the_end(cell) for cell in cells}
+    assert before[True] == []
+    ends = [cell.game.settings.num_rounds for cell in before[False]]
+    assert ends == [1470, 1485, 1478, 1492]
 
 
 @pytest.mark.parametrize(("moves", "how"), [(0.0, "differs"), (2.0, "unsettled")])
@@ -171,7 +187,10 @@ def test_only_what_does_not_rest_may_be_elsewhere(toy, monkeypatch, moves, how):
         side = np.where(rows["run"] % 2, 1.0, -1.0)
         return rows.assign(value=rows["value"] + side * (1 + moves * (cell.power == 0.25)))
 
-    experiment = Experiment(elsewhere, Cell, short, earlier=lambda cell: replace(cell, power=0.25))
+    def before(cell: Cell) -> list[Cell]:
+        return [replace(cell, power=0.25)]
+
+    experiment = Experiment(elsewhere, Cell, short, near_the_end=before)
     monkeypatch.setitem(registry.CHAPTERS["lqr"], "toy", experiment)
     parts = list(confirm.full_batches(["lqr"]))
     assert {confirm._outcome(part, toy)[1]["how"] for part in parts} == {how}

@@ -15,7 +15,7 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from experiments.experiment import Experiment
+from experiments.experiment import Experiment, with_fewer
 from experiments.games import scalar_control
 from experiments.rows import tidy
 from experiments.store import select
@@ -361,17 +361,16 @@ def short(cell: Trajectory | Vote | Steps | Gap) -> Trajectory | Vote | Steps | 
     return replace(cell, num_rounds=30) if isinstance(cell, Gap) else cell
 
 
-def earlier(cell: Trajectory) -> Trajectory | None:
-    """Without the last fiftieth of the rounds, where only the end counts."""
+def near_the_end(cell: Trajectory) -> list[Trajectory]:
+    """At moments of the last fiftieth of the rounds, where only the end counts."""
     if cell.on_the_way:
-        return None
-    settings = cell.game.settings
-    settings = replace(settings, num_rounds=settings.num_rounds * 49 // 50)
-    return replace(cell, game=replace(cell.game, settings=settings))
+        return []
+    fewer = with_fewer(cell.game.settings, "num_rounds")
+    return [replace(cell, game=replace(cell.game, settings=settings)) for settings in fewer]
 
 
 EXPERIMENTS = {
-    name: Experiment(run_trajectory, Trajectory, short, (0,), earlier=earlier)
+    name: Experiment(run_trajectory, Trajectory, short, (0,), near_the_end=near_the_end)
     for name in ("field", "averages", "shares", "paths")
 } | {
     "vote": Experiment(run_vote, Vote, short, (0, 1, 190)),

@@ -21,7 +21,7 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from experiments.experiment import Experiment
+from experiments.experiment import Experiment, with_fewer
 from experiments.rows import tidy
 from ipo.checks import Count, Positive, checked, one_of
 
@@ -189,4 +189,9 @@ def short(cell: Cell) -> Cell:
     return replace(cell, num_rounds=10)
 
 
-EXPERIMENT = Experiment(run_relu, Cell, short, tuple(range(5)))
+def near_the_end(cell: Cell) -> list[Cell]:
+    """At moments of the last fiftieth of the rounds."""
+    return with_fewer(cell, "num_rounds")
+
+
+EXPERIMENT = Experiment(run_relu, Cell, short, tuple(range(5)), near_the_end=near_the_end)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from experiments.experiment import Experiment
+from experiments.experiment import Experiment, near_the_end
 from experiments.figures import OUTCOMES
 from experiments.games import played as games_played
 from experiments.games import players, relu
@@ -294,10 +295,14 @@ def short(cell: Cell) -> Cell:
     return replace(cell, settings=replace(cell.settings, num_rounds=30))
 
 
+rounds_near_the_end = partial(near_the_end, steps="num_rounds")
 EXPERIMENTS = (
-    {name: Experiment(run_cell, Cell, short, (0,)) for name in ("table", "optima", "starts")}
+    {
+        name: Experiment(run_cell, Cell, short, (0,), near_the_end=rounds_near_the_end)
+        for name in ("table", "optima", "starts")
+    }
     | {
-        name: Experiment(run_cell, Cell, short, (0, 1, 200))
+        name: Experiment(run_cell, Cell, short, (0, 1, 200), near_the_end=rounds_near_the_end)
         for name in ("grid", "random", "ablation")
     }
     | {"players": players.EXPERIMENT, "relu": relu.EXPERIMENT}
