@@ -56,7 +56,7 @@ def scaling(bench: dict) -> str:
     median = bench["median"]
     return (
         f"A sweep of {median['CPU-seconds']:.0f} CPU-seconds (`tests/bench/bench_scaling.py`, "
-        f"{bench['machine']}, load {median['load before']:.1f} before it began, median of "
+        f"{bench['machine']}, load {median['load before']:.1f} before it began, rounds: "
         f"{bench['rounds']}) was {median['times as fast']:.2f} times as fast with two workers as "
         f"with one, and its jobs cost {median['CPU-seconds beside each other']:.2f} times as many "
         "CPU-seconds beside each other as alone. With this factor for more than one core, and "

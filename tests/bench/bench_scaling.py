@@ -103,10 +103,14 @@ def main() -> None:
                 }
             )
             print(", ".join(f"{name} {value:.2f}" for name, value in rounds[-1].items()))
-    if options.json:
-        median = {key: statistics.median(r[key] for r in rounds) for key in rounds[0]}
-        numbers = {"machine": machine(), "rounds": len(rounds), "median": median, "gib": gib}
-        write_record(options.json, numbers)
+            if options.json:  # after each: a round takes minutes
+                write_record(options.json, summary(rounds, gib))
+
+
+def summary(rounds: list[dict[str, float]], gib: dict[str, float]) -> dict[str, object]:
+    """The record of all rounds so far."""
+    median = {key: statistics.median(r[key] for r in rounds) for key in rounds[0]}
+    return {"machine": machine(), "rounds": len(rounds), "median": median, "gib": gib}
 
 
 if __name__ == "__main__":
