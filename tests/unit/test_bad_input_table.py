@@ -655,7 +655,7 @@ def rows_of_experiments() -> Iterator[Row]:
         run=FUNCTION,
         cell=OBJECT,
         short=FUNCTION,
-        earlier=FUNCTION,
+        near_the_end=FUNCTION,
         seeds=bad("kind of object", 3, "01", (0.5,)) + bad("range", (-1,), (0, 0), ()),
         reads=FUNCTION,
     )
