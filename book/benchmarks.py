@@ -10,7 +10,7 @@ RECORD = DATA / "bench" / "own_domains.json"
 
 def overview() -> str:
     record = read_record(RECORD)
-    heads = ["Environment", "", "Frames", "Frames per CPU second", "Return"]
+    heads = ["Environment", "Learner", "Frames", "Frames per CPU second", "Return"]
     lines = [f"| {' | '.join(heads)} |", "|:--|:--|--:|--:|--:|"]
     for row in record["rows"]:
         frames, speed = f"{row['frames']:,}", f"{row['frames_per_cpu_second']:,.0f}"

@@ -24,6 +24,8 @@ from outputs import cells_of_source, first_line, last_started, run_record, with_
 
 WORKER = "import json, papermill; papermill.execute_notebook(**json.loads(sys.argv[1]))"
 LEAST_FREE = 2**20  # bytes of a disk that is not full
+# Fonts of this environment, and no settings of the user's, who may draw otherwise elsewhere.
+DRAWING = Path(sys.prefix) / "share" / "matplotlib"
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -110,8 +112,12 @@ class Run:
 
 def execute(notebooks: list[Notebook], jobs: int) -> list[str]:
     """Execute notebooks, so many at a time; returns what to say about each that failed."""
+    if not notebooks:
+        return []
+    list_fonts()
     threads = str(max(1, joblib.cpu_count() // jobs))
     environment = dict.fromkeys(THREAD_VARIABLES, threads) | {
+        "MPLCONFIGDIR": str(DRAWING),
         # This environment's kernel, whatever kernels the user has installed elsewhere.
         "JUPYTER_PREFER_ENV_PATH": "1",
         # Bars are plain text here, and need no widgets.
@@ -144,6 +150,12 @@ def execute(notebooks: list[Notebook], jobs: int) -> list[str]:
             run.process.terminate()
             run.process.wait()
     return failures
+
+
+def list_fonts() -> None:
+    """Look for them now: a notebook that did would say among its outputs how long it takes."""
+    command = [sys.executable, "-c", "import matplotlib.font_manager"]
+    subprocess.run(command, env=os.environ | {"MPLCONFIGDIR": str(DRAWING)}, capture_output=True)
 
 
 class Progress:

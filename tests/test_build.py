@@ -63,6 +63,15 @@ def test_second_build_does_nothing(toy, capsys):
     assert tree_hash(toy / "book") == before
 
 
+def test_figures_do_not_depend_on_how_the_user_draws(toy, tmp_path, monkeypatch):
+    (tmp_path / "matplotlibrc").write_text("font.size: 99\n")
+    monkeypatch.setenv("MPLCONFIGDIR", str(tmp_path))
+    cell = "import matplotlib\nprint(matplotlib.rcParams['font.size'])"
+    write_notebook(toy, "plain", [CELLS["plain"][0], (cell, "")])
+    assert main(["--chapter", "plain"], toy) == 0
+    assert "10.0" in executed(toy, "plain.ipynb").read_text()
+
+
 @pytest.mark.parametrize(
     ("path", "text", "expected"),
     [
