@@ -14,10 +14,10 @@ import torch
 from torch import Tensor
 
 from ipo.checks import Natural, Positive, check_checkpoints, checked, one_of
-from ipo.game import Cost, LinearPlayers, Order, average, moves, nash_gap
+from ipo.game import GAMES, Cost, LinearPlayers, Order, average, moves, nash_gap
 from ipo.optimizers import make_optimizer
 
-GAME_METHODS = ("pooled", "ipo", "ensemble", "separate")
+GAME_METHODS = (*GAMES, "separate")
 
 Costs = Annotated[Sequence[Cost], "E"]  # of the domains
 Players = Annotated[Tensor, "R E P"]
@@ -31,11 +31,13 @@ class GameSettings:
 
     Attributes:
         method: ``pooled`` is one player that owns all domains, ``ipo`` a player for each domain,
-            ``ensemble`` as many players, each of which owns all domains; in ``separate``
-            everybody trains a policy of its own, and they are averaged only at the end.
+            ``ensemble`` as many players, each of which owns all domains; ``in_turn`` is one player
+            that visits the domains; in ``separate`` everybody trains a policy of its own, and they
+            are averaged only at the end.
         optimizer: ``plain`` or ``adam``, one for each player.
         learning_rate: of each player.
-        num_rounds: in each of which every player makes one step.
+        num_rounds: in each of which every player makes one step, or the only one a step on each
+            domain.
         bound: players stay within ``[-bound, bound]`` in every weight; ``None``: no bound.
         order: ``in_turn`` (Algorithm 1), or ``together``: everybody at the same average.
         max_gradient_norm: bound on the norm of each player's gradient.
@@ -70,8 +72,10 @@ def play(
     if settings.method == "separate":
         yield from _play_separately(costs, start, settings, checkpoints)
         return
-    owned = [move.domains for move in moves(settings.method, len(costs))]
-    starts = start if start.dim() == 3 else start.unsqueeze(1).expand(-1, len(owned), -1)
+    made = moves(settings.method, len(costs))
+    objectives = [_mean_of([costs[d] for d in move.domains]) for move in made]
+    num_players = made[-1].player + 1
+    starts = start if start.dim() == 3 else start.unsqueeze(1).expand(-1, num_players, -1)
     players = LinearPlayers(
         starts,
         lambda weights: make_optimizer(settings.optimizer, weights, settings.learning_rate),
@@ -79,13 +83,15 @@ def play(
         settings.max_gradient_norm,
         settings.order,
     )
-    objectives = [_mean_of([costs[d] for d in domains]) for domains in owned]
+    # Who visits the domains alone makes a round in each.
+    visits = [objectives] if num_players == len(made) else [[own] for own in objectives]
     wanted = {*checkpoints, settings.num_rounds}
     for number in range(settings.num_rounds + 1):
         if number in wanted:
             yield number, players.weights
         if number < settings.num_rounds:
-            players.round(objectives)
+            for visited in visits:
+                players.round(visited)
 
 
 def _play_separately(
@@ -175,7 +181,7 @@ def vote(optima: Annotated[Tensor, "... E P"], bound: Positive) -> Tensor:
 
 
 def _check_start(costs: Sequence[Cost], start: Tensor, settings: GameSettings) -> None:
-    num_players = 1 if settings.method == "pooled" else len(costs)
+    num_players = 1 if settings.method in ("pooled", "in_turn") else len(costs)
     if start.dim() == 3 and start.shape[1] != num_players:
         raise ValueError(f"start: is of {start.shape[1]} players, must be of {num_players}")
     policy = average(start) if start.dim() == 3 else start

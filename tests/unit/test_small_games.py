@@ -74,6 +74,16 @@ def test_players_that_own_all_domains_find_pooled_least_squares(method):
     assert_close(average(last(problem.costs, double([[0.0, 0.0]]), rule)), problem.pooled())
 
 
+def test_one_player_in_turn_steps_down_one_domain_after_the_other():
+    problem = effect_of_target(double([[1.0, -0.4]]))
+    by_hand = double([[0.2, 0.1]])
+    for cost in problem.costs * 2:
+        leaf = by_hand.clone().requires_grad_()
+        by_hand = by_hand - 0.1 * torch.autograd.grad(cost(leaf).sum(), leaf)[0]
+    rule = GameSettings("in_turn", learning_rate=0.1, num_rounds=2)
+    assert_close(last(problem.costs, double([[0.2, 0.1]]), rule), by_hand.unsqueeze(1))
+
+
 def test_separate_players_find_their_own_optima():
     problem = effect_of_target(double([[1.0, -0.4, 0.3]]))
     players = last(problem.costs, double([[0.0, 0.0]]), GameSettings("separate", num_rounds=3000))

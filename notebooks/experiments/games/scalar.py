@@ -100,6 +100,7 @@ def standard(num_domains: int) -> dict[str, GameSettings]:
         "ipo_adam_large": GameSettings("ipo", **(adam | {"learning_rate": 2e-2})),
         "ensemble_adam": GameSettings("ensemble", **adam),
         "separate_adam": GameSettings("separate", **adam),
+        "in_turn_adam": GameSettings("in_turn", **adam),
     }
 
 
