@@ -17,6 +17,7 @@ from rules import Cells, NoData
 from rules.verdicts import compare
 
 PICTURE = "advantages.svg"
+FIRST = "many_steps"  # of the maze: what the first predictions were tested with
 
 
 def write_fragments(folder: Path, data: Path = claims.DATA) -> None:
@@ -50,21 +51,28 @@ def clause(part: dict, book: dict, data: Path) -> str:
 
 def maze(data: Path = claims.DATA) -> str:
     """At how many points of the maze the game helps and harms, of those where theory says so."""
-    stores = [Store(data / "results" / "cue", name) for name in training.PHASES.values()]
-    rows = pd.concat([store.rows() for store in stores])
-    if rows.empty:
+    phases = beside_theory(list(training.PHASES.values()), data)
+    first = beside_theory([FIRST], data)
+    if not phases or not first:
         return ""
-    found = outcomes.differences(outcomes.by_run(rows), outcomes.BASELINES)
-    counts = outcomes.difference_counts(outcomes.with_predictions(found))
-    beside = counts.set_index("IPO against").loc["PPO"]
-    better, worse = (
-        f"{beside[f'… came out {sign}']} of {beside[f'predicted {sign}']}"
-        for sign in ("better", "worse")
-    )
     return (
         "In {doc}`a maze where domains disagree <cue>`, IPO does better than PPO in "
-        f"{better} cases where theory predicts it, and worse in {worse}."
+        f"{phases['better']} cases where theory predicts it, after {first['better']} in a first "
+        f"round of other training, and worse in {phases['worse']}."
     )
+
+
+def beside_theory(names: list[str], data: Path) -> dict[str, str]:
+    """By what was predicted of IPO against PPO: how often it came out so; nothing without rows."""
+    rows = pd.concat([Store(data / "results" / "cue", name).rows() for name in names])
+    if rows.empty:
+        return {}
+    found = outcomes.differences(outcomes.by_run(rows), ["ppo"])
+    [counts] = outcomes.difference_counts(outcomes.with_predictions(found)).to_dict("records")
+    return {
+        sign: f"{counts[f'… came out {sign}']} of {counts[f'predicted {sign}']}"
+        for sign in ("better", "worse")
+    }
 
 
 def advantages(book: dict, data: Path = claims.DATA) -> Iterator[Advantage]:

@@ -7,7 +7,7 @@ import pandas as pd
 
 from experiments.games.relu import NAMES, ends
 from experiments.tables import chosen_by
-from rules.cells import Cells, NoData, label
+from rules.cells import Cells, NoData, in_brackets, label
 from rules.keys import narrower
 from rules.verdicts import (
     CONTRADICTED,
@@ -28,16 +28,23 @@ def game_beside(
     game: str,
     baseline: str,
     metrics: dict[str, list[str]],
-    criterion: str,
+    criterion: str | None,
     margin: float,
+    guessing: dict[str, float],
 ) -> Finding:
-    """The game's test error is at most by a share larger than the baseline's, in every problem."""
+    """The game's test error is at most by a share larger than the baseline's, in every problem.
+
+    ``guessing``: the error of who guesses, where there is such a thing. To be as good as a baseline
+    that is worse than that is no merit, and the finding says so.
+    """
     verdicts, parts = [], []
     for problem, ours, base in pairs(cells, game, baseline, metrics, criterion):
-        found = compare(ours, base)
-        low, high = found.difference.low, found.difference.high
+        mean, low, high, _ = compare(ours, base).difference
         verdicts.append(within(low, high, -np.inf, margin * base.mean()))
-        parts.append(f"{problem} {ours.mean():.2f} and {base.mean():.2f}, {verdicts[-1]}")
+        by = in_brackets(mean, low, high, "+.2f")
+        parts.append(f"{problem} {ours.mean():.2f} and {base.mean():.2f}, by {by}, {verdicts[-1]}")
+        if min(ours.mean(), base.mean()) > guessing.get(problem, np.inf):
+            parts[-1] += f", though guessing has {guessing[problem]:.2f}"
     counts = counted(verdicts)
     evidence = f"test errors of {label(game)} and {label(baseline)}: {'; '.join(parts)} ({counts})"
     return Finding(together(verdicts), evidence)
@@ -49,27 +56,33 @@ def game_varies_less(
     game: str,
     baseline: str,
     metrics: dict[str, list[str]],
-    criterion: str,
+    criterion: str | None,
 ) -> Finding:
     """The game's test errors are nearer to their median over runs, in every problem."""
     compared, parts = [], []
     for problem, ours, base in pairs(cells, game, baseline, metrics, criterion):
         compared.append(narrower(ours, base))
-        parts.append(f"{problem} {ours.std():.3f} and {base.std():.3f}")
+        nearer = in_brackets(*compared[-1].difference[:3], "+.3f")
+        parts.append(f"{problem} {ours.std():.3f} and {base.std():.3f}, nearer by {nearer}")
     verdicts = decided(compared)
     evidence = (
         f"significantly less in {verdicts.count(REPRODUCED)} of {len(verdicts)} problems, "
         f"significantly more in {verdicts.count(CONTRADICTED)}; standard deviations of the test "
-        f"error of {label(game)} and {label(baseline)}: {'; '.join(parts)}"
+        f"error of {label(game)} and {label(baseline)}, and by how much the game is nearer to its "
+        f"median: {'; '.join(parts)}"
     )
     return Finding(together(verdicts), evidence)
 
 
 def pairs(
-    cells: Cells, game: str, baseline: str, metrics: dict[str, list[str]], criterion: str
+    cells: Cells, game: str, baseline: str, metrics: dict[str, list[str]], criterion: str | None
 ) -> list[tuple[str, pd.Series, pd.Series]]:
-    """Test errors of both by problem; each run with the penalty that has the lowest criterion."""
-    chosen = Cells(chosen_by(cells.rows, criterion), cells.num_runs)
+    """Test errors of both by problem; each run with the penalty that has the lowest criterion.
+
+    ``None``: all runs with the largest penalty.
+    """
+    rows = chosen_by(cells.rows, criterion) if criterion else strongest(cells.rows)
+    chosen = Cells(rows, cells.num_runs)
     return [
         (
             problem,
@@ -81,6 +94,12 @@ def pairs(
         for metric, problems in metrics.items()
         for problem in problems
     ]
+
+
+def strongest(rows: pd.DataFrame) -> pd.DataFrame:
+    """The rows of the largest penalty of a method in a problem."""
+    own = rows.groupby(["problem", "method"], observed=True)["penalty"]
+    return rows[rows["penalty"] == own.transform("max")]
 
 
 def equilibria_are_invariant(

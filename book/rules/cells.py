@@ -17,6 +17,9 @@ NAMES = {
     "overparameterized": "overparameterised",
     "ipo_fixed_phi": "IPO, fixed Φ",
     "ipo_variable_phi": "IPO, variable Φ",
+    "ipo_variable_phi_phi0.01_gain0": "IPO, variable Φ from 0.01",
+    "ipo_variable_phi_phi0.1_gain0": "IPO, variable Φ from 0.1",
+    "ipo_variable_phi_phi0.3_gain0": "IPO, variable Φ from 0.3",
     "in_turn": "one learner on one domain at a time",
     "in_turn_short": "one learner on one domain at a time, fewer rounds",
     "ipo_together": "IPO, players moving together",
@@ -31,6 +34,7 @@ NAMES = {
     "ipo_adam": "IPO with Adam",
     "ipo_plain": "IPO with plain steps",
     "ipo_phi": "IPO with variable Φ",
+    "ipo_phi_short": "IPO with variable Φ and half the rounds",
     "ipo_inner2": "IPO with K = 2",
     "irmv1": "IRMv1",
     "irm_game_fixed_phi": "IRM-Games, fixed Φ",
@@ -68,9 +72,11 @@ class Cells:
         by_domain = [self.runs(domain=domain, **where) for domain in domains]
         return pd.concat(by_domain, axis=1).agg(summary, axis=1)
 
-    def beginning_with(self, run: int) -> Cells:
-        """Without the runs before this one."""
-        return replace(self, rows=self.rows[self.rows["run"] >= run], num_runs=self.num_runs - run)
+    def between(self, first: int, last: int) -> Cells:
+        """Of these runs alone."""
+        runs = self.rows["run"]
+        own = self.rows[(first <= runs) & (runs <= last)]
+        return replace(self, rows=own, num_runs=min(self.num_runs, last + 1) - first)
 
 
 def published(paper: pd.DataFrame) -> Iterator[tuple[dict[str, Any], float, float]]:
@@ -109,18 +115,26 @@ def shown(number: float, spec: str = "z.1f") -> str:
 
 def with_interval(mean: float, low: float, high: float, digits: int = 3) -> str:
     """An effect and its 95 % interval, with their signs."""
-    effect, *ends = (shown(number, f"+.{digits}f") for number in (mean, low, high))
-    return f"{effect}, 95 % interval [{', '.join(ends)}]"
+    return in_brackets(mean, low, high, f"+.{digits}f").replace(" [", ", 95 % interval [")
 
 
-def paper_tests(paper: pd.DataFrame, method: str, baseline: str, num_runs: int) -> str:
-    """What the paper's own means and standard deviations say, by Welch's test.
+def in_brackets(mean: float, low: float, high: float, spec: str) -> str:
+    """The same, shorter, for several in a row: the page says what brackets are."""
+    effect, *ends = (shown(number, spec) for number in (mean, low, high))
+    return f"{effect} [{', '.join(ends)}]"
+
+
+def welch_of_tables(
+    paper: pd.DataFrame, method: str, baseline: str, num_runs: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """P of the paper's own differences ``[cells]`` by Welch's test, from its tables.
 
     The ± of a table may be the deviation of its runs themselves (ddof 0), or the estimate of that
-    of all runs there could be (ddof 1).
+    of all runs there could be (ddof 1): p of the one reading, and of the other.
     """
+    columns = [name for name in paper.columns if name not in ("method", "mean", "std", "text")]
     ours, theirs = (
-        paper[paper["method"] == name].sort_values("domain") for name in (method, baseline)
+        paper[paper["method"] == name].sort_values(columns) for name in (method, baseline)
     )
     zero, one = (
         scipy.stats.ttest_ind_from_stats(
@@ -130,6 +144,12 @@ def paper_tests(paper: pd.DataFrame, method: str, baseline: str, num_runs: int) 
         ).pvalue
         for scale in (np.sqrt(num_runs / (num_runs - 1)), 1.0)
     )
+    return zero, one
+
+
+def paper_tests(paper: pd.DataFrame, method: str, baseline: str, num_runs: int) -> str:
+    """What the paper's own means and standard deviations say, by Welch's test."""
+    zero, one = welch_of_tables(paper, method, baseline, num_runs)
     return f"by Welch's test p = {span(zero)} where its ± has ddof 0, {span(one)} where it has 1"
 
 

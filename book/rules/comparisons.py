@@ -38,18 +38,20 @@ def means_come_back(
     Within ``num_errors`` standard errors of the difference, or within the rounding of what is
     printed. ``where`` says which rows of a method are meant.
     """
-    good, parts, missed = [], [], []
+    good, bounds, parts, missed = [], [], [], []
     for cell, mean, std in published(paper):
         ours = cells.runs(metric=metric, **cell, **where[cell["method"]])
         error = np.hypot(std / np.sqrt(num_paper_runs), ours.sem())
-        good.append(abs(ours.mean() - mean) <= max(num_errors * error, 0.5 * 10**-digits))
+        bounds.append(max(num_errors * error, 0.5 * 10**-digits))
+        good.append(abs(ours.mean() - mean) <= bounds[-1])
         name = f"{label(cell['method'])} on {cell['domain']}"
         parts.append(f"{name} {ours.mean():.3f} (paper {mean:.{digits}f})")
         if not good[-1]:
             missed.append(name)
     counts = f"{sum(good)} of {len(good)} are reproduced"
     counts += f", not {', '.join(missed)}" if missed else ""
-    return Finding(together(map(holds, good)), f"{counts}: {'; '.join(parts)}")
+    allowed = f"by tolerances from {min(bounds):.3f} to {max(bounds):.3f}"
+    return Finding(together(map(holds, good)), f"{counts}, {allowed}: {'; '.join(parts)}")
 
 
 def spreads_come_back(
@@ -75,11 +77,13 @@ def spreads_come_back(
         p.append(2 * min(smaller, 1 - smaller))
     same = [adjusted >= 0.05 for adjusted in holm(p)]
     near = sum(0.9 <= ratio <= 1.1 for ratio in ratios)
+    least, most = np.sqrt(scipy.stats.f.ppf([0.025, 0.975], len(ours) - 1, num_paper_runs - 1))
     return Finding(
         together(map(holds, same)),
         f"{sum(same)} of {len(same)} do not differ beyond chance; ours are {min(ratios):.2f} to "
         f"{max(ratios):.2f} times the paper's, with median {np.median(ratios):.2f}; {near} within "
-        "a tenth of the paper's",
+        f"a tenth of the paper's; by itself, a test of so few runs calls only what is below "
+        f"{least:.2f} or above {most:.2f} times the paper's different",
     )
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 
 from rules.cells import Cells, label, paper_effect
-from rules.verdicts import Compared, Finding, compare, holds
+from rules.verdicts import Compared, Finding, compare, holds, together
 
 
 def smaller_spread(
@@ -48,18 +48,30 @@ def narrower(
 
 
 def not_better(
-    cells: Cells, paper: pd.DataFrame, method: str, baseline: str, domain: str, metric: str
+    cells: Cells,
+    paper: pd.DataFrame,
+    domain: str,
+    metric: str,
+    comparisons: dict[str, dict],
 ) -> Finding:
-    """The method is not better than the baseline beyond chance."""
-    ours, theirs = (
-        cells.runs(method=name, domain=domain, metric=metric) for name in (method, baseline)
-    )
-    found = compare(ours, theirs)
-    evidence = (
-        f"{label(method)} has {ours.mean():.3f} on {domain}, {label(baseline)} "
-        f"{theirs.mean():.3f}: {found.text()}"
-    )
-    return Finding(holds(found.difference.low <= 0), evidence)
+    """In no comparison is a method better than its baseline beyond chance.
+
+    A comparison names both, and the ``first`` and ``last`` of the runs that count.
+    """
+    verdicts, parts = [], []
+    for name, own in comparisons.items():
+        chosen = cells.between(own["first"], own["last"])
+        ours, theirs = (
+            chosen.runs(method=own[arm], domain=domain, metric=metric)
+            for arm in ("method", "baseline")
+        )
+        found = compare(ours, theirs)
+        verdicts.append(holds(found.difference.low <= 0))
+        parts.append(
+            f"{name}, {len(ours)} runs: {label(own['method'])} has {ours.mean():.3f} on {domain}, "
+            f"{label(own['baseline'])} {theirs.mean():.3f}, {found.text()}"
+        )
+    return Finding(together(verdicts), "; ".join(parts))
 
 
 def degrades(

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import itertools
 
+import numpy as np
 import pandas as pd
 
-from rules.cells import Cells, label, published, shown
+from rules.cells import Cells, in_brackets, label, published, shown, welch_of_tables
 from rules.verdicts import (
     CONTRADICTED,
     IN_PART,
@@ -17,11 +18,13 @@ from rules.verdicts import (
     compare,
     decided,
     holds,
+    holm,
     together,
     within,
 )
 
 CONFIGURATION = ["num_domains", "dim_distractor"]
+Size = tuple[int, int]
 
 
 def costs(cells: Cells, method: str, num_domains: int, dim_distractor: int, domain: str = "test"):
@@ -40,7 +43,7 @@ def cells_come_back(
     cells: Cells, paper: pd.DataFrame, tolerance: dict[str, float], first_run: int
 ) -> Finding:
     """Every mean of the paper within the tolerance of its method, over the runs from the first."""
-    scored = cells.beginning_with(first_run)
+    scored = cells.between(first_run, cells.num_runs - 1)
     inside, parts = [], []
     for method, bound in tolerance.items():
         apart = [
@@ -79,12 +82,12 @@ def significantly_lower(
         f"own means are lower in {sum(gain > 0 for gain in own)})"
     )
     exceptions = [
-        f"{compared(*arm)} by {shown(gain.difference.mean)}, {found}"
+        f"{compared(*arm)} by {text(gain)}, {found}"
         for arm, gain, found in zip(arms, gains, verdicts, strict=True)
         if found != REPRODUCED
     ]
     opposite = [
-        f"{compared(*arm)} by {shown(gain.difference.mean)}, in the paper by {shown(gap)}"
+        f"{compared(*arm)} by {text(gain)}, in the paper by {shown(gap)}"
         for arm, gain, gap, found in zip(arms, gains, own, verdicts, strict=True)
         if gap < 0 and found == REPRODUCED
     ]
@@ -96,48 +99,72 @@ def significantly_lower(
 
 
 def span(gains: list[Compared]) -> str:
-    """By how much, from the smallest to the largest mean difference."""
-    return f", by {shown(min(means(gains)))} to {shown(max(means(gains)))}" if gains else ""
+    """By how much, from the smallest to the largest mean difference, with their intervals."""
+    ends = [pick(gains, key=lambda own: own.difference.mean) for pick in (min, max) if gains]
+    return f", by {' to '.join(map(text, ends))}" if ends else ""
 
 
 def no_benefit(
-    cells: Cells, paper: pd.DataFrame, method: str, baseline: str, corrected: bool
+    cells: Cells,
+    paper: pd.DataFrame,
+    method: str,
+    baseline: str,
+    corrected: bool,
+    num_paper_runs: int,
+    sizes: list[Size] | None,
 ) -> Finding:
-    """The method is nowhere lower than the baseline beyond chance."""
-    sizes = configurations(paper)
-    gains = [compare(costs(cells, baseline, *s), costs(cells, method, *s)) for s in sizes]
+    """The method is nowhere lower than the baseline beyond chance; ``None``: in both tables."""
+    at = sizes or configurations(paper)
+    gains = [compare(costs(cells, baseline, *s), costs(cells, method, *s)) for s in at]
     lower = [found == REPRODUCED for found in decided(gains, corrected)]
-    where = [
-        f"{describe(*size)} by {shown(gain.difference.mean)}"
-        for size, gain, is_lower in zip(sizes, gains, lower, strict=True)
-        if is_lower
-    ]
     evidence = (
         f"{label(method)} is significantly lower than {label(baseline)} in {sum(lower)} of "
-        f"{len(lower)} configurations"
+        f"{len(lower)} configurations: by "
+        + "; ".join(f"{text(gain)} at {describe(*s)}" for s, gain in zip(at, gains, strict=True))
     )
-    evidence += ": " + "; ".join(where) if where else ""
-    return Finding(together(holds(not is_lower) for is_lower in lower), evidence)
+    verdict = together(holds(not is_lower) for is_lower in lower)
+    return Finding(verdict, evidence, lower_in_tables(paper, method, baseline, num_paper_runs))
+
+
+def lower_in_tables(paper: pd.DataFrame, method: str, baseline: str, num_runs: int) -> str:
+    """In how many columns of the paper's own tables a method is lower beyond chance (Holm)."""
+    if not {method, baseline} <= set(paper["method"]):
+        return ""
+    mean = paper.set_index(["method", *CONFIGURATION])["mean"].sort_index()
+    gains = (mean[baseline] - mean[method]).to_numpy()
+    zero, one = (
+        sum(gain > 0 and p < 0.05 for gain, p in zip(gains, holm(own.tolist()), strict=True))
+        for own in welch_of_tables(paper, method, baseline, num_runs)
+    )
+    return (
+        f"by Welch's test {label(method)} is significantly lower in {zero} of its {len(gains)} "
+        f"columns where its ± has ddof 0, in {one} where it has 1 (Holm)"
+    )
 
 
 def largely_similar(
-    cells: Cells, paper: pd.DataFrame, method: str, baseline: str, margin: float
+    cells: Cells,
+    paper: pd.DataFrame,
+    method: str,
+    baseline: str,
+    margin: float,
+    sizes: list[Size] | None,
 ) -> Finding:
     """The interval of the difference lies within a share of the baseline's cost, everywhere."""
     verdicts, relative, gains = [], [], []
-    for size in configurations(paper):
+    for size in sizes or configurations(paper):
         ours, base = costs(cells, method, *size), costs(cells, baseline, *size)
         gains.append(compare(ours, base))
-        bound = margin * base.mean()
-        verdicts.append(within(gains[-1].difference.low, gains[-1].difference.high, -bound, bound))
-        relative.append(gains[-1].difference.mean / base.mean())
+        mean, low, high, _ = gains[-1].difference
+        relative.append((mean / base.mean(), low / base.mean(), high / base.mean()))
+        verdicts.append(within(*relative[-1][1:], -margin, margin))
     apart = sum(own.difference.p < 0.05 for own in gains)
     corrected = sum(found != UNDECIDED for found in decided(gains))
+    ends = " to ".join(in_brackets(*own, "+.1%") for own in sorted({min(relative), max(relative)}))
     evidence = (
         f"within {margin:.0%} in {verdicts.count(REPRODUCED)} of {len(verdicts)} configurations, "
-        f"beyond in {verdicts.count(CONTRADICTED)}; {label(method)} differs by "
-        f"{shown(min(relative), '+.1%')} to {shown(max(relative), '+.1%')}, beyond chance in "
-        f"{apart} ({corrected} by Holm's method)"
+        f"beyond in {verdicts.count(CONTRADICTED)}; {label(method)} differs by {ends}, beyond "
+        f"chance in {apart} ({corrected} by Holm's method)"
     )
     return Finding(together(verdicts), evidence)
 
@@ -157,6 +184,35 @@ def overfits(cells: Cells, paper: pd.DataFrame, method: str, corrected: bool) ->
     return Finding(together(verdicts), evidence)
 
 
+def ignores(
+    cells: Cells, paper: pd.DataFrame, method: str, baseline: str, remaining_share: float
+) -> Finding:
+    """At most a share of the baseline's gain on distractors is left, in every configuration.
+
+    By the Frobenius norm of the gain's columns for distractors, zero in the invariant controller.
+    """
+    verdicts, left = [], []
+    for num_domains, dim_distractor in configurations(paper):
+        ours, base = (
+            cells.runs(
+                metric="gain_norm_distractor",
+                method=name,
+                num_domains=num_domains,
+                dim_distractor=dim_distractor,
+                optimizer="adam",
+            )
+            for name in (method, baseline)
+        )
+        mean, low, high, _ = compare(ours, base).difference
+        share = [1 + own / base.mean() for own in (mean, low, high)]
+        verdicts.append(within(*share[1:], -np.inf, remaining_share))
+        left.append(f"{in_brackets(*share, '.0%')} at {describe(num_domains, dim_distractor)}")
+    evidence = (
+        f"of {label(baseline)}'s gain on distractors, {label(method)} has left {'; '.join(left)}"
+    )
+    return Finding(together(verdicts), evidence)
+
+
 def tends_to_oracle(
     cells: Cells,
     paper: pd.DataFrame,
@@ -167,26 +223,28 @@ def tends_to_oracle(
 ) -> Finding:
     """The cost falls with every step, and at most a share of the gap to the oracle is left."""
     by_number = [costs(cells, method, number, dim_distractor) for number in num_domains]
-    oracle = costs(cells, "oracle", num_domains[0], dim_distractor).mean()
+    oracle = costs(cells, "oracle", num_domains[0], dim_distractor)
     falls = together(decided([compare(*pair) for pair in itertools.pairwise(by_number)]))
-    gaps = [values.mean() - oracle for values in by_number]
-    close = gaps[-1] <= remaining_share * gaps[0]
-    evidence = f"gap of {label(method)} to the oracle ({oracle:.1f}): " + "; ".join(
-        f"{number} domains {gap:.1f}" for number, gap in zip(num_domains, gaps, strict=True)
+    gaps = [compare(values, oracle) for values in by_number]
+    first, last = (gaps[i].difference.mean for i in (0, -1))
+    close = last <= remaining_share * first
+    evidence = f"gap of {label(method)} to the oracle ({oracle.mean():.1f}): " + "; ".join(
+        f"{number} domains {text(gap)}" for number, gap in zip(num_domains, gaps, strict=True)
     )
     return Finding(falls if close or falls != REPRODUCED else IN_PART, evidence)
 
 
-def configurations(paper: pd.DataFrame) -> list[tuple[int, int]]:
+def configurations(paper: pd.DataFrame) -> list[Size]:
     """The paper's pairs of number of domains and distractor dimension."""
     return list(paper[CONFIGURATION].drop_duplicates().itertuples(index=False, name=None))
 
 
-def means(compared: list[Compared]) -> list[float]:
-    return [own.difference.mean for own in compared]
+def text(own: Compared) -> str:
+    """A difference of costs with its interval."""
+    return in_brackets(*own.difference[:3], "z.1f")
 
 
-def compared(method: str, baseline: str, size: tuple[int, int]) -> str:
+def compared(method: str, baseline: str, size: Size) -> str:
     return f"{label(method)} under {label(baseline)} at {describe(*size)}"
 
 

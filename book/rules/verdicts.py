@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import pandas as pd
+import scipy.optimize
 import scipy.stats
 
 from ipo.stats import Difference, holm, paired_difference, power
@@ -129,6 +130,12 @@ def compare(
     mean = float(values.mean() - baseline.mean())
     found = Difference(mean, *test.confidence_interval(0.95), float(test.pvalue))
     return Compared(found, np.hypot(values.std(), baseline.std()), len(values), effect)
+
+
+def detectable(spread: float, num_runs: int) -> float:
+    """The smallest effect that so many runs find with a power of 80 %."""
+    in_spreads = scipy.optimize.brentq(lambda e: power(e, 1.0, num_runs) - 0.8, 1e-6, 100.0)
+    return float(in_spreads * spread)
 
 
 def decided(compared: Sequence[Compared], corrected: bool = True) -> list[str]:

@@ -132,9 +132,9 @@ def runs_for(difference: float, rows: pd.DataFrame) -> int:
 
 
 def p_of_spreads(rows: pd.DataFrame, metric: str) -> float:
-    """Brown-Forsythe test of whether IPO and PPO vary equally on grey."""
-    pair = _on_grey(rows, "ipo", "ppo", metric=metric)
-    return scipy.stats.levene(*pair, center="median").pvalue
+    """Brown-Forsythe test of whether IPO and PPO vary equally on grey, paired by run."""
+    apart = [np.abs(own - np.median(own)) for own in _on_grey(rows, "ipo", "ppo", metric=metric)]
+    return paired_difference(*apart).p
 
 
 def encodings(

@@ -461,13 +461,25 @@ def test_better_in_the_worst_colour_or_not(empty, ipo, expected):
 
 
 @pytest.mark.parametrize(
-    ("with_phi", "expected"),
-    [(0.79, claims.CONTRADICTED), (0.75, claims.REPRODUCED), (0.70, claims.REPRODUCED)],
+    ("short", "long", "expected"),
+    [
+        (0.79, 0.79, claims.CONTRADICTED),
+        (0.74, 0.79, claims.IN_PART),
+        (0.74, 0.70, claims.REPRODUCED),
+    ],
 )
-def test_updating_the_convolutions_has_a_benefit_or_not(empty, with_phi, expected):
-    arms = {("ipo_phi", "grey"): (with_phi, 0.1), ("ipo_inner2", "grey"): (0.75, 0.101)}
+def test_updating_the_convolutions_has_a_benefit_or_not(empty, short, long, expected):
+    """At the paper's frames, and at twice as many."""
+    arms = {
+        ("ipo_phi_short", "grey"): (short, 0.1),
+        ("ipo_phi", "grey"): (long, 0.1),
+        **{(baseline, "grey"): (0.75, 0.101) for baseline in ("ipo", "ipo_inner2")},
+    }
     write_keys(empty, arms, "keys/in_full")
     assert verdict(empty, "keys-no-benefit") == expected
+    found = finding(empty, "keys-no-benefit").variants
+    again = next(name for name in found if "runs 50 to 99" in name)
+    assert "50 runs" in found[again].evidence
 
 
 @pytest.mark.parametrize(
@@ -548,6 +560,20 @@ def test_policies_pull_in_one_way_or_not(empty, part, spread, hooks, outside):
     write_door(empty, "strategies", inside_part=cells)
     assert verdict(empty, "door-strategies") == hooks
     assert verdict(empty, "door-outside") == outside
+
+
+@pytest.mark.parametrize(
+    ("ipo", "ppo", "expected"),
+    [
+        (0.95, 0.05, claims.REPRODUCED),
+        (0.95, 0.94, claims.CONTRADICTED),
+        (0.05, 0.95, claims.CONTRADICTED),
+    ],
+)
+def test_policies_differ_in_kind_or_not(empty, ipo, ppo, expected):
+    parts = {("ipo", HALF, 0.1): (ipo, 0.02), ("ppo", FULL, 0.1): (ppo, 0.02)}
+    write_door(empty, "strategies", inside_part=parts)
+    assert verdict(empty, "door-qualitative") == expected
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,9 @@ from rules import (
     NoData,
 )
 from rules.cells import paper_effect, paper_tests
-from rules.verdicts import compare, decided, holm, together, verdict, within
+from rules.door import power_beyond_half
+from rules.lqr import lower_in_tables
+from rules.verdicts import compare, decided, detectable, holm, power, together, verdict, within
 
 NOISE = np.array([-2.0, -1, 0, 1, 2])
 
@@ -117,6 +119,34 @@ def test_the_papers_own_table_as_a_test():
     assert "p = 0.25 where its ± has ddof 0, 0.23 where it has 1" in text
 
 
+def test_what_the_papers_tables_say_of_columns():
+    columns = [(2, 78.8, 3.5, 71.3, 2.1), (4, 57.7, 1.0, 57.8, 1.0)]
+    lines = [
+        (method, number, 1000, *own)
+        for number, *both in columns
+        for method, own in (("fixed", both[:2]), ("variable", both[2:]))
+    ]
+    names = ["method", "num_domains", "dim_distractor", "mean", "std"]
+    paper = pd.DataFrame(lines, columns=names)
+    text = lower_in_tables(paper, "variable", "fixed", 10)
+    assert "in 1 of its 2 columns where its ± has ddof 0, in 1 where it has 1" in text
+    assert "in 0 of its 2" in lower_in_tables(paper, "fixed", "variable", 10)
+    assert lower_in_tables(paper, "variable", "another", 10) == ""
+
+
+def test_the_smallest_effect_that_is_found_has_a_power_of_80_percent():
+    assert power(detectable(2.0, 10), 2.0, 10) == pytest.approx(0.8)
+    assert detectable(2.0, 10) == pytest.approx(2 * detectable(1.0, 10))
+
+
+def test_power_to_tell_a_share_from_a_half_by_hand():
+    least = 9 / 10  # of ten, nine is the first whose exact interval lies above a half
+    expected = 10 * 0.6**9 * 0.4 + 0.6**10
+    assert scipy.stats.binomtest(int(10 * least), 10).proportion_ci().low > 0.5
+    assert scipy.stats.binomtest(8, 10).proportion_ci().low < 0.5
+    assert power_beyond_half(0.6, 10) == pytest.approx(expected)
+
+
 # ------------------------------------------------------------------------------- single rules
 
 
@@ -180,6 +210,25 @@ def test_standard_deviations_come_back_or_not(scale, expected):
 
 
 @pytest.mark.parametrize(
+    ("left", "expected"),
+    [(0.05, REPRODUCED), (0.1, UNDECIDED), (0.9, CONTRADICTED), (1.1, CONTRADICTED)],
+)
+def test_distractors_are_ignored_or_not(left, expected):
+    paper = pd.DataFrame({"num_domains": [2, 5], "dim_distractor": [100, 100]})
+    columns = ["method", "num_domains", "dim_distractor", "optimizer", "metric"]
+    values = {
+        (method, number, 100, "adam", "gain_norm_distractor"): 4 * share + 0.01 * NOISE
+        for number in (2, 5)
+        for method, share in (("ipo", left), ("pooled", 1.0))
+    }
+    wiggle = {key: runs[::-1] for key, runs in values.items() if key[0] == "pooled"}
+    settings = {"method": "ipo", "baseline": "pooled", "remaining_share": 0.1}
+    found = RULES["ignores"](cells_of(values | wiggle, columns), paper, **settings)
+    assert found.verdict == expected
+    assert f"{left:.0%} [" in found.evidence
+
+
+@pytest.mark.parametrize(
     ("shift", "expected"), [(0, REPRODUCED), (8, UNDECIDED), (30, CONTRADICTED), (-30, REPRODUCED)]
 )
 def test_a_game_is_as_good_as_the_penalty_or_not(shift, expected):
@@ -199,9 +248,14 @@ def test_a_game_is_as_good_as_the_penalty_or_not(shift, expected):
         "metrics": {"error": ["digits"]},
         "criterion": "criterion",
         "margin": 0.1,
+        "guessing": {"digits": 50.0},
     }
     found = RULES["game_beside"](cells_of(values, keys), pd.DataFrame(), **settings)
     assert found.verdict == expected
+    assert "though guessing has 50" in found.evidence
+    settings |= {"criterion": None, "guessing": {}}  # beside the largest penalty, which has 1
+    strong = RULES["game_beside"](cells_of(values, keys), pd.DataFrame(), **settings)
+    assert strong.verdict == CONTRADICTED and "guessing" not in strong.evidence
 
 
 @pytest.mark.parametrize(

@@ -255,12 +255,38 @@ def verdict_numbers(
             found[f"rate_{arm}_{place}"] = 100 * rate(success, arms[arm], friction).mean()
             found[f"paper_{method}_{place}"] = 100 * means[method, str(friction)]
     steps = {arm: gradient_steps(arms[arm]) for arm in ("ppo", "ipo")}
+    gap = paper_gap(paper, tested)
+    rates = {arm: mean_rate(success, arms[arm], tested) for arm in ("ppo", "ipo", "ipo_half")}
+    for name, arm in (("published", "ipo_half"), ("equal", "ipo")):
+        spread = 100 * float((rates[arm] - rates["ppo"]).std())
+        found[f"needed_{name}"] = runs_needed(gap, spread)
     return found | {
-        "paper_gap": paper_gap(paper, tested),
+        "paper_gap": gap,
+        "tolerance": 100 * max(tolerances(success, arms, tested, paper)),
         "gradient_steps": steps["ppo"],
         "gradient_ratio": steps["ipo"] / steps["ppo"],
         "num_minibatches": arms["ipo"].trained.settings.num_minibatches,
     }
+
+
+def tolerances(
+    success: pd.DataFrame,
+    arms: Mapping[str, Cell],
+    tested: Sequence[float],
+    paper: pd.DataFrame,
+    num_paper_runs: int = 5,
+) -> list[float]:
+    """Two standard errors of the difference between our means and the paper's, as published."""
+    spreads = paper.set_index(["method", "domain"])["std"]
+    return [
+        2
+        * np.hypot(
+            spreads[arms[arm].trained.label, str(friction)] / np.sqrt(num_paper_runs),
+            rate(success, arms[arm], friction).sem(),
+        )
+        for arm in PUBLISHED
+        for friction in tested
+    ]
 
 
 def paper_gap(paper: pd.DataFrame, tested: Sequence[float]) -> float:
