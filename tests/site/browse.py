@@ -42,6 +42,11 @@ CONTENT = """async () => {
       .filter(m => !m.querySelector('mjx-container') || source(m).match(/\\\\[(\\[]/))
       .map(m => m.textContent.slice(0, 200)),
     equations: all('mjx-container').length,
+    // Mathematics that was not read as such.
+    dollars: all('.bd-article :is(p, li, td, dd, figcaption)')
+      .flatMap(e => [...e.childNodes])
+      .filter(node => node.nodeType === Node.TEXT_NODE && node.data.includes('$'))
+      .map(node => node.data.slice(0, 200)),
     math_errors: all('[data-mml-node="merror"], mjx-merror').map(m => m.outerHTML.slice(0, 200)),
     figures: all('.bd-article figure').map(f => ({
       number: f.querySelector('.caption-number')?.innerText.trim() ?? '',

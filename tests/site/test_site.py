@@ -73,7 +73,7 @@ def bad_images(seen: Visit) -> list[dict]:
 def bad_equations(seen: Visit) -> list[str]:
     """Mathematics that was not set, set twice, or set as an error."""
     content = seen.content
-    wrong = content["unrendered"] + content["math_errors"]
+    wrong = content["unrendered"] + content["math_errors"] + content["dollars"]
     if content["equations"] != content["math"]:
         wrong.append(f"{content['math']} pieces of mathematics, {content['equations']} equations")
     return wrong
