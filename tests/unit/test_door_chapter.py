@@ -184,6 +184,9 @@ def test_numbers_of_the_verdict(success, paper):
     assert found["paper_gap"] == 25
     assert found["gradient_steps"] == 4 * 10 * 32 / 1000
     assert found["gradient_ratio"] == 2
+    assert found["needed_published"] >= 2 and found["needed_equal"] >= 2
+    of_paper = 2 * 0.1 / np.sqrt(5)  # the least that is allowed, if ours did not vary
+    assert found["tolerance"] >= 100 * of_paper
 
 
 def test_minibatches_of_each_player():

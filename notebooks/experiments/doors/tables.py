@@ -200,10 +200,15 @@ def controlled(
                 "95 %": f"[{found.low:+.1f}, {found.high:+.1f}]",
                 "p": found.p,
                 "power": power(effect, spread, len(runs)) if spread else 1.0,
-                "needed": runs_needed(effect, spread) if spread else 2,
+                "needed": pairs_needed(effect, spread),
             }
         )
     return pd.DataFrame(rows)
+
+
+def pairs_needed(effect: float, spread: float) -> int:
+    """How many pairs find an effect with a power of 80 %; two, if they do not differ at all."""
+    return runs_needed(effect, spread) if spread else 2
 
 
 def control_numbers(controlled: pd.DataFrame) -> dict[str, Any]:
@@ -256,10 +261,10 @@ def verdict_numbers(
             found[f"paper_{method}_{place}"] = 100 * means[method, str(friction)]
     steps = {arm: gradient_steps(arms[arm]) for arm in ("ppo", "ipo")}
     gap = paper_gap(paper, tested)
-    rates = {arm: mean_rate(success, arms[arm], tested) for arm in ("ppo", "ipo", "ipo_half")}
+    ppo = mean_rate(success, arms["ppo"], tested)
     for name, arm in (("published", "ipo_half"), ("equal", "ipo")):
-        spread = 100 * float((rates[arm] - rates["ppo"]).std())
-        found[f"needed_{name}"] = runs_needed(gap, spread)
+        spread = 100 * float((mean_rate(success, arms[arm], tested) - ppo).std())
+        found[f"needed_{name}"] = pairs_needed(gap, spread)
     return found | {
         "paper_gap": gap,
         "tolerance": 100 * max(tolerances(success, arms, tested, paper)),
