@@ -109,22 +109,31 @@ def controls(num_updates: int = 95, curve_every: int = 10, **changes: Any) -> di
     They end where the published training of IPO did: the ensemble, whose players learn from all
     doors; one network that learns from one domain at a time; IPO with PPO's learning rate. The
     latter two have IPO's doors by themselves. With the same doors: PPO, PPO with one network of as
-    many weights as IPO's two, and the ensemble.
+    many weights as IPO's two, PPO with as many doors of one domain as of the other, and the
+    ensemble.
     """
 
-    def control(label: str, method: str, learning_rate: float, **options: Any) -> Cell:
+    def control(
+        label: str,
+        method: str,
+        learning_rate: float,
+        same_doors: bool = True,
+        hidden: tuple[int, ...] = (64, 64),
+        **own: Any,
+    ) -> Cell:
         settings = published_door(
-            method, learning_rate=learning_rate, num_updates=num_updates, **changes
+            method, learning_rate=learning_rate, num_updates=num_updates, **changes, **own
         )
-        return Cell(label, settings, (num_updates,), curve_every, **options)
+        return Cell(label, settings, (num_updates,), curve_every, same_doors, hidden)
 
     cells = [
-        control("ensemble", "ensemble", 5e-4),
-        control("in_turn", "in_turn", 5e-4),
-        control("ipo_lr1e-3", "ipo", 1e-3),
-        control("ppo_same_doors", "ppo", 1e-3, same_doors=True),
-        control("ppo_wide_same_doors", "ppo", 1e-3, same_doors=True, hidden=(94, 94)),
-        control("ensemble_same_doors", "ensemble", 5e-4, same_doors=True),
+        control("ensemble", "ensemble", 5e-4, same_doors=False),
+        control("in_turn", "in_turn", 5e-4, same_doors=False),
+        control("ipo_lr1e-3", "ipo", 1e-3, same_doors=False),
+        control("ppo_same_doors", "ppo", 1e-3),
+        control("ppo_wide_same_doors", "ppo", 1e-3, hidden=(94, 94)),
+        control("ppo_16_16", "ppo", 1e-3, num_envs=(16, 16)),
+        control("ensemble_same_doors", "ensemble", 5e-4),
     ]
     return {cell.label: cell for cell in cells}
 
