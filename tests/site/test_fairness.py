@@ -112,7 +112,10 @@ def test_the_sentences_on_keys():
         assert interval("keys", aspect, name)[1] < 0
     for aspect, name in (
         ("Network size", "against PPO with as many"),
-        ("Weights of the domains", "three quarters of the frames in red"),
+        (
+            "Weights of the domains",
+            "three quarters of the frames in red, learning rates as published",
+        ),
     ):
         assert interval("keys", aspect, name)[0] > 0
 
