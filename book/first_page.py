@@ -56,9 +56,9 @@ def maze(data: Path = claims.DATA) -> str:
     if not phases or not first:
         return ""
     return (
-        "In {doc}`a maze where domains disagree <cue>`, IPO does better than PPO in "
-        f"{phases['better']} cases where theory predicts it, after {first['better']} in a first "
-        f"round of other training, and worse in {phases['worse']}."
+        "In {doc}`a maze where domains disagree <cue>`, IPO beats PPO in "
+        f"{phases['better']} cases where theory predicts it (first round: {first['better']}), and "
+        f"loses in {phases['worse']}."
     )
 
 
