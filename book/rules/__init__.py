@@ -40,6 +40,7 @@ RULES = {
         lqr.largely_similar,
         lqr.overfits,
         lqr.ignores,
+        lqr.ahead_in_the_worst,
         lqr.tends_to_oracle,
         comparisons.means_come_back,
         comparisons.spreads_come_back,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from experiments import causality, keys, keys_labels, lqr, own_domains
+from experiments import causality, keys, keys_labels, lqr, lqr_worst, own_domains
 from experiments.cue import training as cue
 from experiments.doors import success as door
 from experiments.experiment import Experiment, Places
@@ -16,7 +16,7 @@ from ipo.checks import check_choice
 
 DATA = ROOT / "data"
 CHAPTERS: dict[str, dict[str, Experiment]] = {
-    "lqr": lqr.EXPERIMENTS | linear.EXPERIMENTS,
+    "lqr": lqr.EXPERIMENTS | lqr_worst.EXPERIMENTS | linear.EXPERIMENTS,
     "keys": keys.EXPERIMENTS | trials.EXPERIMENTS | keys_labels.EXPERIMENTS,
     "cue": cue.EXPERIMENTS,
     "causality": causality.EXPERIMENTS,

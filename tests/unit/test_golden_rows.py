@@ -6,7 +6,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from experiments import lqr, lqr_turns
+from experiments import lqr, lqr_turns, lqr_worst
 from experiments.experiment import filled
 from experiments.paper import read_paper
 from experiments.registry import CHAPTERS
@@ -38,6 +38,7 @@ ASKED = {  # cells and number of runs
     "controls": (lqr.control_cells([2, 5, 10], 1000, 5000), 10),
     "regularized": ([c for n in (2, 5, 10) for c in trials.lqr_cells(n, 1000, 5000)], 10),
     "turns": (lqr_turns.turn_cells(SIZES, 5000), 10),
+    "worst": (lqr_worst.worst_cells(SIZES, 5000), 10),
 }
 UNREACHED = pytest.mark.xfail(strict=True, reason="no reading of the unpublished start reaches it")
 

@@ -229,6 +229,39 @@ def test_distractors_are_ignored_or_not(left, expected):
 
 
 @pytest.mark.parametrize(
+    ("ahead", "expected"),
+    [
+        ((0.2, 0.1), REPRODUCED),
+        ((0.2, 0.0), IN_PART),
+        ((0.0, 0.0), UNDECIDED),
+        ((-0.2, -0.1), CONTRADICTED),
+    ],
+)
+def test_ahead_in_the_worst_domain_or_not(ahead, expected):
+    paper = pd.DataFrame({"num_domains": [2, 5], "dim_distractor": [100, 100]})
+    metrics = {"efficiency_worst": 0.4, "share_unstable": 0.125, "opposed_radius": 1.5}
+    values = {
+        (method, number, 100, "adam", metric): value + 0.01 * noise
+        for metric, value in metrics.items()
+        for number in (2, 5)
+        for method, noise in (("ipo", NOISE), ("pooled", NOISE[::-1]))
+    }
+    for number, by in zip((2, 5), ahead, strict=True):
+        values["ipo", number, 100, "adam", "efficiency_worst"] += by
+    values["pooled", 2, 100, "adam", "opposed_radius"] = 0 * NOISE  # this loop is stable
+    columns = ["method", "num_domains", "dim_distractor", "optimizer", "metric"]
+    settings = {"method": "ipo", "baseline": "pooled", "metric": "efficiency_worst"}
+    found = RULES["ahead_in_the_worst"](
+        cells_of(values, columns), paper, corrected=True, **settings
+    )
+    assert found.verdict == expected
+    runs = len(NOISE)
+    assert f"chosen against it in {2 * runs} of {2 * runs} runs" in found.evidence
+    assert f"chosen against it in {runs} of {2 * runs} runs" in found.evidence
+    assert "unstable in 12.5% to 12.5% of the new domains" in found.evidence
+
+
+@pytest.mark.parametrize(
     ("shift", "expected"), [(0, REPRODUCED), (8, UNDECIDED), (30, CONTRADICTED), (-30, REPRODUCED)]
 )
 def test_a_game_is_as_good_as_the_penalty_or_not(shift, expected):
