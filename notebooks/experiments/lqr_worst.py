@@ -20,6 +20,7 @@ from experiments.rows import tidy
 from experiments.store import select
 from ipo.lqr import LQR, riccati_gain, sample_problem, training_costs
 
+CONFIGURATION = ["num_domains", "dim_distractor"]
 NUM_NEW = 100  # domains in which every controller is tried
 WANTED = {  # by metric: what it is called, and how it is shown
     "efficiency_mean": ("efficiency, mean over new domains", ".0%"),
@@ -99,3 +100,23 @@ def worst_table(rows: pd.DataFrame, dim_distractor: int) -> pd.DataFrame:
         for metric, (words, spec) in WANTED.items()
     )
     return table.rename(columns={n: f"{n} domains" for n in mean.columns})
+
+
+def worst_numbers(rows: pd.DataFrame, dim_distractor: int) -> dict[str, float | str]:
+    """Numbers for the prose, by arm.
+
+    Efficiency in the worst new domain with the fewest and the most training domains, mean over
+    runs; the largest share of unstable loops in any configuration. Of all arms together: how many
+    controllers are unstable in the domain chosen against them, and the smallest spectral radius.
+    """
+    mean = rows.groupby(["metric", "method", *CONFIGURATION])["value"].mean()
+    worst = select(rows, {"metric": "efficiency_worst", "dim_distractor": dim_distractor})
+    by_number = worst.groupby(["num_domains", "method"])["value"].mean().unstack()
+    radius = rows.loc[rows["metric"] == "opposed_radius", "value"]
+    return {
+        **by_number.iloc[0].add_prefix("few_"),
+        **by_number.iloc[-1].add_prefix("most_"),
+        **mean["share_unstable"].groupby("method").max().add_prefix("unstable_"),
+        "opposed": f"{(radius >= 1).sum()} of {len(radius)}",
+        "least_radius": radius.min(),
+    }

@@ -94,3 +94,16 @@ def test_the_table_has_means_over_runs_by_arm():
     ]
     for column in ("2 domains", "3 domains"):
         assert list(table[column]) == 3 * ["38%", "38%", "37.5%", "0.38"]
+
+
+def test_numbers_for_the_prose():
+    cells = lqr_worst.worst_cells([(2, 20), (3, 20)], num_iterations=3)
+    shares = dict.fromkeys(("efficiency_worst", "share_unstable"), torch.tensor([0.25, 0.5]))
+    metrics = shares | {"opposed_radius": torch.tensor([0.5, 1.5])}
+    rows = pd.concat(
+        tidy(cell, SEEDS, {("new", name): own for name, own in metrics.items()}) for cell in cells
+    )
+    found = lqr_worst.worst_numbers(rows, dim_distractor=20)
+    assert found["few_ipo_fixed_phi"] == found["most_in_turn"] == 0.375
+    assert found["unstable_gradient_descent"] == 0.375
+    assert (found["opposed"], found["least_radius"]) == ("6 of 12", 0.5)
