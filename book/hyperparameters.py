@@ -11,14 +11,14 @@ import pandas as pd
 from experiments.doors.training import TRAIN_FRICTIONS, published_door
 from experiments.keys import TRAINED, published
 from experiments.paper import read_paper
-from ipo.lqr_learners import LQRSettings, published_lqr
+from ipo.lqr_learners import LQR_METHODS, LQRSettings, published_lqr
 from ipo.ppo import PPOSettings
 
 NUM_DOMAINS = {"keys": len(TRAINED), "door": len(TRAIN_FRICTIONS)}
 SETTINGS: dict[tuple[str, str], PPOSettings | LQRSettings] = {
     **{
         ("lqr", method): published_lqr(method)
-        for method in ("gradient_descent", "overparameterized", "ipo_fixed_phi")
+        for method in LQR_METHODS
     },
     **{("keys", method): published(method) for method in ("ppo", "ipo")},
     ("door", "ppo"): published_door("ppo"),
@@ -27,7 +27,8 @@ SETTINGS: dict[tuple[str, str], PPOSettings | LQRSettings] = {
 NAMES = {
     "gradient_descent": "Gradient descent",
     "overparameterized": "Overparam.",
-    "ipo_fixed_phi": "IPO",
+    "ipo_fixed_phi": "IPO, fixed Φ",
+    "ipo_variable_phi": "IPO, variable Φ",
     "ppo": "PPO",
     "ipo": "IPO",
 }
@@ -84,6 +85,8 @@ OURS: dict[str, Callable[[Any, int], Any]] = {
     "optimiser": lambda own, _: IN_WORDS[own.optimizer],
     "iterations": lambda own, _: own.num_iterations,
     "hidden units": lambda own, _: own.num_hidden,
+    "start of Φ or K₁": lambda own, _: f"N(0, {own.phi_scale:g}²)",
+    "start of Kᵈ or K₂": lambda own, _: f"N(0, {own.gain_scale:g}²)" if own.gain_scale else "0",
     "learning rate": lambda own, _: own.learning_rate,
     "time-steps per rollout": lambda own, _: own.num_steps,
     "epochs per rollout": lambda own, _: own.num_epochs,
