@@ -1,10 +1,12 @@
 """No result is typed by hand: a number in the prose is glued from rows, or declared a definition.
 
 ``definitions.yml`` has the numerals that no run can change, as they stand in the text: settings,
-labels of domains and runs, what the paper's text says. Results are glued.
+labels of domains and runs, what the paper's text says. Results are glued. A page has the words of
+the table in ``data/`` that it is made from, too.
 """
 
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
 import nbformat
@@ -13,6 +15,11 @@ import yaml
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [*sorted((ROOT / "notebooks").glob("*.ipynb")), *sorted((ROOT / "book").glob("*.md"))]
+TABLES = {"claims": "claims.yml", "fairness": "fairness.yml", "settings": "deviations.yml"}
+WORDS = {  # what tables say in words; all else is cells and settings, or names them
+    *("title", "claim", "test", "where", "measure", "label", "aspect", "unequal"),
+    *("what", "text", "programs", "here", "effect"),
+}
 DEFINITIONS = yaml.safe_load((Path(__file__).parent / "definitions.yml").read_text("utf-8"))
 
 NO_PROSE = re.compile(
@@ -27,7 +34,8 @@ NO_PROSE = re.compile(
     # The numbers of headings, of lists and of the steps of a proof.
     | ^\s*(?:\#+\ )?\*?\d+\.\*?\s
     # References to parts of the paper and of the page, names of runs.
-    | (?:Sections?|Parts?|Tables?|Figures?|Figs?\.|Algorithm|Definitions?|[Ll]ines?|[Rr]uns?)\s
+    | (?:Sections?|Parts?|Tables?|Figures?|Figs?\.|Algorithm|Equations?|Definitions?
+        |[Ll]ines?|[Rr]uns?)\s
       \d[\d.]*[a-z]?\b(?:(?:,|\ and|\ to)\s\d+[a-z]?\b)*
     """,
     re.VERBOSE | re.DOTALL | re.MULTILINE,
@@ -40,7 +48,11 @@ SENTENCE = re.compile(r"(?<=[.:;!?])\s|\n\s*\n|\n(?=[-|*])")
 def texts_of(page: Path) -> dict[str, str]:
     """Prose by place: cells of markdown, and captions and descriptions of figures."""
     if page.suffix == ".md":
-        return {"page": page.read_text("utf-8")}
+        found = {"page": page.read_text("utf-8")}
+        if page.stem in TABLES:
+            table = yaml.safe_load((ROOT / "data" / TABLES[page.stem]).read_text("utf-8"))
+            found[TABLES[page.stem]] = "\n\n".join(words_of(table))
+        return found
     found = {}
     for number, cell in enumerate(nbformat.read(page, as_version=4).cells):
         shown = cell.metadata.get("mystnb", {})
@@ -50,6 +62,19 @@ def texts_of(page: Path) -> dict[str, str]:
             found[f"caption of cell {number}"] = shown.get("figure", {}).get("caption", "")
             found[f"description of cell {number}"] = shown.get("image", {}).get("alt", "")
     return found
+
+
+def words_of(value: object) -> Iterator[str]:
+    """Words of a table without what is filled in: {…}. Names of variants are settings."""
+    if isinstance(value, list):
+        for part in value:
+            yield from words_of(part)
+    elif isinstance(value, dict):
+        for key, part in value.items():
+            if key in WORDS and isinstance(part, str):
+                yield re.sub(r"\{[^}]*\}", " ", part)
+            else:
+                yield from words_of(part)
 
 
 def prose(markdown: str) -> str:
