@@ -16,10 +16,7 @@ from ipo.ppo import PPOSettings
 
 NUM_DOMAINS = {"keys": len(TRAINED), "door": len(TRAIN_FRICTIONS)}
 SETTINGS: dict[tuple[str, str], PPOSettings | LQRSettings] = {
-    **{
-        ("lqr", method): published_lqr(method)
-        for method in LQR_METHODS
-    },
+    **{("lqr", method): published_lqr(method) for method in LQR_METHODS},
     **{("keys", method): published(method) for method in ("ppo", "ipo")},
     ("door", "ppo"): published_door("ppo"),
     ("door", "ipo"): published_door("ipo", num_updates=95),  # the policies "as published"

@@ -103,18 +103,26 @@ def better(
     """
     verdicts, parts, tests = [], [], []
     tested = paper[paper["domain"].isin(map(str, domains))]
-    for name, (method, baseline) in comparisons.items():
-        ours, theirs = (
-            cells.over(domains, over, metric=metric, **arm) for arm in (method, baseline)
-        )
-        methods = method["method"], baseline["method"]
+    for name, arms in comparisons.items():
+        ours, theirs = (cells.over(domains, over, metric=metric, **arm) for arm in arms)
+        methods = [arm["method"] for arm in arms]
         effect = paper_effect(paper, *methods, domains, over)
         if effect is not None:
             tests.append(paper_tests(tested, *methods, num_paper_runs))
         found = compare(ours, theirs, effect, paired)
         verdicts.append(found.verdict)
         parts.append(f"{name}: {ours.mean():.3f} and {theirs.mean():.3f}, {found.text()}")
+        if over == "min":
+            where = (worst_places(cells, domains, metric=metric, **arm) for arm in arms)
+            parts[-1] += f"; the worst is {' and '.join(where)} runs"
     return Finding(together(verdicts), "; ".join(parts), "; ".join(dict.fromkeys(tests)))
+
+
+def worst_places(cells: Cells, domains: list, **where: Any) -> str:
+    """In how many runs each domain is the worst, the most frequent first."""
+    by_domain = {str(domain): cells.runs(domain=domain, **where) for domain in domains}
+    counts = pd.DataFrame(by_domain).idxmin(axis=1).value_counts()
+    return ", ".join(f"{domain} in {number}" for domain, number in counts.items())
 
 
 def because_of_the_game(
