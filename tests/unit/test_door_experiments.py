@@ -20,6 +20,7 @@ from experiments.doors.success import (
 from experiments.doors.training import (
     CELLS,
     NETWORK,
+    TRAIN_FRICTIONS,
     last_info,
     made_for,
     make_doors,
@@ -121,24 +122,39 @@ def test_the_wide_network_has_as_many_weights_as_two():
     assert size("ppo_wide_same_doors") == pytest.approx(2 * size("ipo"), rel=0.01)
 
 
-@pytest.mark.parametrize("label", ["ppo_same_doors", "ensemble_same_doors", "in_turn"])
+def doors_of(label, num_envs=(4, 2)):
+    """Of every domain, in their order, with the starts: the first ones of a training."""
+    settings = replace(CELLS[label].settings, num_envs=num_envs, num_steps=8, num_minibatches=1)
+    training = new_training(replace(CELLS[label], settings=settings), seeds=[3])
+    drawn = []
+    for collector in training.collectors:
+        collector.environments.reset()
+        own = collector.environments.envs
+        drawn += zip(own.params, own.handle_shifts.tolist(), strict=True)
+    return [[door for door in drawn if door[0].friction == f] for f in TRAIN_FRICTIONS]
+
+
+@pytest.mark.parametrize(
+    "label", ["ppo_same_doors", "ppo_by_domain", "ensemble_same_doors", "in_turn"]
+)
 def test_arms_with_the_same_doors_have_those_of_ipo(label):
-    """Of every domain, in the same order, whoever learns from them; the same starts as well."""
-
-    def doors(label):
-        cell = CELLS[label]
-        settings = replace(cell.settings, num_envs=(4, 2), num_steps=8, num_minibatches=1)
-        training = new_training(replace(cell, settings=settings), seeds=[3])
-        drawn = []
-        for collector in training.collectors:
-            collector.environments.reset()
-            own = collector.environments.envs
-            drawn += zip(own.params, own.handle_shifts.tolist(), strict=True)
-        return sorted(drawn, key=lambda door: door[0].friction)
-
-    assert doors(label) == doors("ipo")
+    assert doors_of(label) == doors_of("ipo")
     if label != "in_turn":
-        assert doors(label) != doors(label.removesuffix("_same_doors"))
+        assert doors_of(label) != doors_of(CELLS[label].settings.method)
+
+
+def test_the_arm_with_as_many_doors_of_both_has_those_of_ipo_and_more():
+    """It has fewer without friction: the first ones."""
+    assert CELLS["ppo_16_16"].settings.num_envs == (16, 16)
+    without, with_friction = doors_of("ppo_16_16", (3, 3))
+    of_ipo = doors_of("ipo")
+    assert without == of_ipo[0][:3]
+    assert with_friction[:2] == of_ipo[1]
+
+
+def test_the_arm_with_rewards_by_domain_divides_its_copies_as_the_domains_are():
+    (collector,) = new_training(CELLS["ppo_by_domain"], seeds=[0]).collectors
+    assert collector.normalizer.scales == [24, 8]
 
 
 def test_the_published_settings():

@@ -29,7 +29,8 @@ CONTROLS = {
     "ipo_lr1e-3": "IPO with PPO's learning rate",
     "ppo_same_doors": "PPO, same doors",
     "ppo_wide_same_doors": "PPO, same doors, as many weights",
-    "ppo_16_16": "PPO, same doors, 16 with each friction",
+    "ppo_16_16": "PPO, same doors, as many of both frictions",
+    "ppo_by_domain": "PPO, same doors, rewards normalised by friction",
     "ensemble_same_doors": "ensemble, same doors",
 }  # as long as IPO as published was trained
 PUBLISHED = ("ppo", "ipo_half")  # with the steps of the published runs
