@@ -8,8 +8,6 @@ from experiments.registry import DATA
 from hyperparameters import NUM_DOMAINS, SETTINGS, envs_of, num_frames, num_gradient_steps
 from measured import listed
 
-NOT_MEASURED = "*not measured*"
-
 
 def settings_by_name() -> dict[str, object]:
     """What the words of the table are filled in from."""
@@ -42,10 +40,7 @@ def table() -> str:
 
 def cell(problem: dict, entry: dict, words: dict[str, object]) -> str:
     """What is unequal, then each difference that was measured."""
-    lines = [entry["unequal"].format(**words), *listed(problem, entry)]
-    if "why" in entry:
-        lines.append(f"{NOT_MEASURED}: {entry['why']}")
-    return "<br>".join(lines)
+    return "<br>".join([entry["unequal"].format(**words), *listed(problem, entry)])
 
 
 def row(cells: list[str]) -> str:

@@ -140,10 +140,10 @@ def test_controls_are_paired_with_the_runs_of_ipo_that_they_have(success):
     arms = ARMS | controls_of(controls(4, 512), frictions=FRICTIONS, num_doors=NUM_DOORS)
     of_ppo = success.query("method == 'ppo' and steps == 32768 and run < 2")
     of_controls = of_ppo.assign(value=of_ppo["run"].map({0: 0.25, 1: 0.5}))
-    more = dict(zip(controls(4, 512), (0.25, 0, -0.25, 0.125, 0, 0.0625, 0.5), strict=True))
+    more = dict(zip(controls(4, 512), (0.25, 0, -0.25, 0.125, 0, 0.0625, -0.125, 0.5), strict=True))
     rows = [of_controls.assign(method=m, value=of_controls["value"] + by) for m, by in more.items()]
     table = door_tables.controlled(pd.concat([success, *rows]), arms, FRICTIONS, effect=10.0)
-    assert list(table["pairs"]) == [3, 2, 2, 2, 2, 2, 2, 2]
+    assert list(table["pairs"]) == [3, 2, 2, 2, 2, 2, 2, 2, 2]
     differences = table.set_index("key")["difference"]
     assert differences["ppo_half"] == pytest.approx(100 / 3)
     for method, by in more.items():

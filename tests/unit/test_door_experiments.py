@@ -134,7 +134,9 @@ def doors_of(label, num_envs=(4, 2)):
     return [[door for door in drawn if door[0].friction == f] for f in TRAIN_FRICTIONS]
 
 
-@pytest.mark.parametrize("label", ["ppo_same_doors", "ensemble_same_doors", "in_turn"])
+@pytest.mark.parametrize(
+    "label", ["ppo_same_doors", "ppo_by_domain", "ensemble_same_doors", "in_turn"]
+)
 def test_arms_with_the_same_doors_have_those_of_ipo(label):
     assert doors_of(label) == doors_of("ipo")
     if label != "in_turn":
@@ -148,6 +150,11 @@ def test_the_arm_with_as_many_doors_of_both_has_those_of_ipo_and_more():
     of_ipo = doors_of("ipo")
     assert without == of_ipo[0][:3]
     assert with_friction[:2] == of_ipo[1]
+
+
+def test_the_arm_with_rewards_by_domain_divides_its_copies_as_the_domains_are():
+    (collector,) = new_training(CELLS["ppo_by_domain"], seeds=[0]).collectors
+    assert collector.normalizer.scales == [24, 8]
 
 
 def test_the_published_settings():

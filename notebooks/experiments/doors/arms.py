@@ -30,6 +30,7 @@ CONTROLS = {
     "ppo_same_doors": "PPO, same doors",
     "ppo_wide_same_doors": "PPO, same doors, as many weights",
     "ppo_16_16": "PPO, same doors, as many of both frictions",
+    "ppo_by_domain": "PPO, same doors, rewards normalised by friction",
     "ensemble_same_doors": "ensemble, same doors",
 }  # as long as IPO as published was trained
 PUBLISHED = ("ppo", "ipo_half")  # with the steps of the published runs

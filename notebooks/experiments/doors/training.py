@@ -108,9 +108,9 @@ def controls(num_updates: int = 95, curve_every: int = 10, **changes: Any) -> di
 
     They end where the published training of IPO did: the ensemble, whose players learn from all
     doors; one network that learns from one domain at a time; IPO with PPO's learning rate. The
-    latter two have IPO's doors by themselves. With the same doors: PPO, PPO with one network of as
-    many weights as IPO's two, PPO with as many doors of one domain as of the other, and the
-    ensemble.
+    latter two have IPO's doors by themselves. With the same doors: the ensemble, PPO, and PPO with
+    one network of as many weights as IPO's two, with as many doors of one domain as of the other,
+    and with the rewards of each domain normalised by themselves.
     """
 
     def control(
@@ -133,6 +133,7 @@ def controls(num_updates: int = 95, curve_every: int = 10, **changes: Any) -> di
         control("ppo_same_doors", "ppo", 1e-3),
         control("ppo_wide_same_doors", "ppo", 1e-3, hidden=(94, 94)),
         control("ppo_16_16", "ppo", 1e-3, num_envs=(16, 16)),
+        control("ppo_by_domain", "ppo", 1e-3, reward_scale="domain"),
         control("ensemble_same_doors", "ensemble", 5e-4),
     ]
     return {cell.label: cell for cell in cells}
