@@ -106,4 +106,4 @@ def test_numbers_for_the_prose():
     found = lqr_worst.worst_numbers(rows, dim_distractor=20)
     assert found["few_ipo_fixed_phi"] == found["most_in_turn"] == 0.375
     assert found["unstable_gradient_descent"] == 0.375
-    assert (found["opposed"], found["least_radius"]) == ("6 of 12", 0.5)
+    assert found["opposed_in_turn"] == "2 of 4"

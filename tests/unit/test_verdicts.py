@@ -229,17 +229,18 @@ def test_distractors_are_ignored_or_not(left, expected):
 
 
 @pytest.mark.parametrize(
-    ("ahead", "expected"),
+    ("ahead", "radius", "expected"),
     [
-        ((0.2, 0.1), REPRODUCED),
-        ((0.2, 0.0), IN_PART),
-        ((0.0, 0.0), UNDECIDED),
-        ((-0.2, -0.1), CONTRADICTED),
+        ((0.2, 0.1), 0.9, REPRODUCED),
+        ((0.2, 0.1), 1.5, IN_PART),
+        ((0.2, 0.0), 0.9, IN_PART),
+        ((0.0, 0.0), 1.5, UNDECIDED),
+        ((-0.2, -0.1), 1.5, CONTRADICTED),
     ],
 )
-def test_ahead_in_the_worst_domain_or_not(ahead, expected):
+def test_ahead_in_the_worst_domain_or_not(ahead, radius, expected):
     paper = pd.DataFrame({"num_domains": [2, 5], "dim_distractor": [100, 100]})
-    metrics = {"efficiency_worst": 0.4, "share_unstable": 0.125, "opposed_radius": 1.5}
+    metrics = {"efficiency_worst": 0.4, "share_unstable": 0.125, "opposed_radius": radius}
     values = {
         (method, number, 100, "adam", metric): value + 0.01 * noise
         for metric, value in metrics.items()
@@ -248,17 +249,19 @@ def test_ahead_in_the_worst_domain_or_not(ahead, expected):
     }
     for number, by in zip((2, 5), ahead, strict=True):
         values["ipo", number, 100, "adam", "efficiency_worst"] += by
-    values["pooled", 2, 100, "adam", "opposed_radius"] = 0 * NOISE  # this loop is stable
+    values["pooled", 2, 100, "adam", "opposed_radius"] = 0 * NOISE
     columns = ["method", "num_domains", "dim_distractor", "optimizer", "metric"]
     settings = {"method": "ipo", "baseline": "pooled", "metric": "efficiency_worst"}
-    found = RULES["ahead_in_the_worst"](
-        cells_of(values, columns), paper, corrected=True, **settings
-    )
+    settings |= {"corrected": True, "opposed": True}
+    rule, cells = RULES["ahead_in_the_worst"], cells_of(values, columns)
+    found = rule(cells, paper, **settings)
     assert found.verdict == expected
-    runs = len(NOISE)
-    assert f"chosen against it in {2 * runs} of {2 * runs} runs" in found.evidence
-    assert f"chosen against it in {runs} of {2 * runs} runs" in found.evidence
-    assert "unstable in 12.5% to 12.5% of the new domains" in found.evidence
+    unstable = [len(NOISE) * n if radius > 1 else 0 for n in (2, 1)]
+    for runs in unstable:
+        assert f"chosen against it in {runs} of {2 * len(NOISE)} runs" in found.evidence
+    assert "an unstable loop in up to 12.5% of the new domains" in found.evidence
+    of_chance = rule(cells, paper, **settings | {"opposed": False}).verdict
+    assert (of_chance == REPRODUCED) == (ahead == (0.2, 0.1))
 
 
 @pytest.mark.parametrize(
