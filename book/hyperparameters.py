@@ -128,7 +128,10 @@ def tables() -> str:
                 {s: f"**{now}**" if differs(texts[s], now) else now for s, now in here.items()}
             )
         table = pd.DataFrame(columns).reindex(rows["setting"].unique()).fillna("")
-        text = table.rename_axis("Setting").to_markdown(disable_numparse=True)
+        table = table.rename_axis("Setting")
+        if len(table.columns) > len(table):  # wider than a page
+            table = table.T.rename_axis("Method")
+        text = table.to_markdown(disable_numparse=True)
         parts.append(f"### {TITLES[problem]}\n\n{text}")
     return "\n\n".join(parts) + "\n"
 

@@ -33,8 +33,9 @@ EMPTY = "EXPERIMENTS, CELLS = {}, ()\n"
 # What the registry imports.
 CHAPTERS = dict.fromkeys(
     [
-        *("causality.py", "keys.py", "keys_labels.py", "own_domains.py", "cue/training.py"),
-        *("doors/success.py", "games/scalar.py", "regularized/linear.py", "regularized/trials.py"),
+        *("causality.py", "keys.py", "keys_labels.py", "lqr_worst.py", "own_domains.py"),
+        *("cue/training.py", "doors/success.py", "games/scalar.py"),
+        *("regularized/linear.py", "regularized/trials.py"),
     ],
     EMPTY,
 ) | {"lqr.py": "from toy_chapter import EXPERIMENTS\n"}
